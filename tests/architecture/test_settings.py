@@ -25,8 +25,8 @@ from worker.domain.spaces import CONTROL_STEP_S
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import BenchmarkConfig
 from worker.ml import acquisition
-from worker.ml.filters import filter_module
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported import filter_module
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import METHODS
 from worker.ml.rewards import reward_training

@@ -27,7 +27,13 @@ from tests.benchmarks.answering import Bench, Chain, Variant
 from worker.analysis.comparison import result_pages
 from worker.analysis.wilson import wilson_interval
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface, best_mode
+from worker.ml.filters.fitting.response_surface import (
+    CAUTION,
+    SUCCESS_PENALTY,
+    SUCCESS_TOLERANCE,
+    ResponseSurface,
+    best_mode,
+)
 from worker.ml.stopping import CANDIDATES, relative_regret
 
 COUNTS = (*range(10, 101, 10), *range(120, 201, 20))

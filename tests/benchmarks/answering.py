@@ -29,8 +29,8 @@ from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.experiments.benchmark_cell import CHOOSE_EVERY
 from worker.jobs.clips import made_pairs
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
-from worker.ml.filters.variations import variation
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting.variations import variation
 from worker.ml.rewards import reward_training
 from worker.ml.rewards.hint_directions import direction
 from worker.ml.rewards.reward_models import RewardModel

@@ -30,8 +30,8 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell, default_method
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters.filter_act import FilterAct
-from worker.ml.filters.filter_onnx import SHIELD
+from worker.ml.filters.exported.filter_act import FilterAct
+from worker.ml.filters.exported.filter_onnx import SHIELD
 from worker.ml.methods import registry as methods
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.bullet import Bullet

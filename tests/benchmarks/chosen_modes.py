@@ -34,7 +34,7 @@ from worker.domain.task import Task
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import bradley_terry, prior
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import TASTES, Manner, Taste, User

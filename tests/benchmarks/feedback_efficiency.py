@@ -39,8 +39,8 @@ from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.gate import signal_changes, successes
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting.gate import signal_changes, successes
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards import calibration, reward_training
 from worker.ml.rewards.prior import Prior
 from worker.ml.rewards.reward_models import RewardModel

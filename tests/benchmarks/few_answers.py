@@ -34,7 +34,13 @@ from worker.domain.responses import TARGETS
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface, best_mode
+from worker.ml.filters.fitting.response_surface import (
+    CAUTION,
+    SUCCESS_PENALTY,
+    SUCCESS_TOLERANCE,
+    ResponseSurface,
+    best_mode,
+)
 from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.prior import Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED

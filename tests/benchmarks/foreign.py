@@ -24,8 +24,8 @@ from worker.domain.scenarios import EVALUATION, POOL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import Manner, ScriptedTeacher

@@ -34,7 +34,7 @@ from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache
-from worker.ml.filters.response_surface import RIDGE, ResponseSurface, best_mode, monomials
+from worker.ml.filters.fitting.response_surface import RIDGE, ResponseSurface, best_mode, monomials
 from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.rewards.prior import DEVIATION, Population, Prior
 from worker.ml.rewards.reward_training import fit, posterior

@@ -29,10 +29,10 @@ from worker.domain.scenarios import EVALUATION, RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.gate import successes
-from worker.ml.filters.pbarl_printed import PrintedConfig
-from worker.ml.filters.printed_filter import fit_printed
+from worker.ml.filters.encoders.pbarl_printed import PrintedConfig
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.fitting.gate import successes
+from worker.ml.filters.fitting.printed_filter import fit_printed
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 

@@ -19,8 +19,8 @@ from tqdm import tqdm
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome, Promise
 from worker.compute.harm_tests import STRENGTHS, weakened_until_promised
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 
 TITLE = "# How often a promise about harm is made wrongly"
 VERSIONS = (1, 2, 3)

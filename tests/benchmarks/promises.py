@@ -35,10 +35,10 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters import filter_act
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported import filter_act
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.teachers import random_taste
 from worker.whole_files import written_whole
 

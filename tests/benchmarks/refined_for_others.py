@@ -35,8 +35,8 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters.filter_problem import FilterProblem
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
 from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import Setting

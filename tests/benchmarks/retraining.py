@@ -32,7 +32,7 @@ from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Ce
 from worker.experiments.rollout_cache import RolloutCache
 from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
 
 STAGES = ("reward", "mode", "residual", "gates", "promise", "evaluation_and_bundle")

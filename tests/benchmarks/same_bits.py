@@ -27,9 +27,9 @@ from worker.compute import simulation
 from worker.domain.trajectory import Trajectory
 from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Cell
 from worker.experiments.rollout_cache import RolloutCache
-from worker.ml.filters import pbarl
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.fitting import pbarl
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.methods import registry
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import MethodConfig

@@ -9,8 +9,8 @@ import pytest
 from tests.lab.test_check import change
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.sim.lab.found import Found
 from worker.tasks import registry
 

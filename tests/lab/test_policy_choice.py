@@ -38,7 +38,7 @@ from worker.jobs.learning.filters import train_filter
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export import bundle
-from worker.ml.filters import policy_choice
+from worker.ml.filters.fitting import policy_choice
 from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy, adapted
 from worker.tasks import registry

@@ -19,8 +19,8 @@ from worker.compute import simulation
 from worker.compute.lab_policies import policy_of
 from worker.experiments import fit_response_surface
 from worker.experiments.lab_ranges import first_found
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.policies.policy_client import PolicyServer

@@ -15,8 +15,8 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.experiments import fit_response_surface
 from worker.experiments.check_lab import Checked, checked
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.ml.policies.policy_client import packed, unpacked

@@ -14,7 +14,7 @@ import pytest
 
 from worker.compute import simulation
 from worker.experiments.check_lab import checked
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies import asked_policy
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks import registry

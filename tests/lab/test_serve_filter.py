@@ -28,8 +28,8 @@ from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.export.filter_loop import FilterLoop, Refused, require_same
 from worker.ml.export.interface import interface_of
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.policies import asked_policy
 from worker.ml.policies.policy_client import PolicyServer, PolicyServerFailed, packed
 from worker.ml.policies.reference import ReferencePolicy

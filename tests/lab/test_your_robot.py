@@ -12,9 +12,9 @@ from app.installed_tasks import lab
 from app.installed_tasks.lab import LabDescription, LabEnvironment, LabPolicy
 from worker.compute import simulation
 from worker.experiments.check_lab import checked
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.sim.lab.environment import LabStep
 from worker.tasks import registry
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import onnx
 import pytest
 
-from worker.ml.filters import filter_onnx
+from worker.ml.filters.exported import filter_onnx
 from worker.whole_files import written_whole
 
 

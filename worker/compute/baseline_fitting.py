@@ -19,10 +19,10 @@ from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller as controller
 from worker.ml.export.blinded_controller import Blinded
-from worker.ml.filters import filter_act
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterProblem
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.exported import filter_act
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import registry
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.methods.registry import MethodConfig, Setting

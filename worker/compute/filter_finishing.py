@@ -15,11 +15,11 @@ from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
-from worker.ml.filters.filter_act import FilterAct
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_onnx import SHIELD
-from worker.ml.filters.policy_choice import SURE
+from worker.ml.filters.exported.filter_act import FilterAct
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_onnx import SHIELD
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.policy_choice import SURE
 from worker.tasks import registry
 
 RECORDED_EPISODES = 2

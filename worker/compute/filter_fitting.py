@@ -18,12 +18,13 @@ from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import RESIDUAL, first_of, of_promise
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import filter_act, mode_search, policy_choice, printed_filter, residual
-from worker.ml.filters.filter_act import FilterAct
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.exported import filter_act
+from worker.ml.filters.exported.filter_act import FilterAct
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting import mode_search, policy_choice, printed_filter, residual
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.reinforcement.refinement import Refinement, given_up, is_promising

@@ -6,8 +6,8 @@ from functools import partial
 from typing import Any
 
 from worker.analysis.filters.promise import BATCH, HarmTest, Outcome, Promise, counted
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 
 Drive = Callable[[FilterWeights, range], Sequence[Outcome]]
 """What came of a filter in these scenarios."""

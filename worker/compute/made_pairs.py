@@ -16,8 +16,11 @@ def modes_of_pair(
 ) -> Sequence[dict[str, float]]:
     """Two modes by the names of their axes; none where nothing can be foreseen: the model is not linear in the signals,
     or the task has no response surface. ``number``: of the pair, each has another variation."""
-    from worker.ml.filters.response_surface import ResponseSurface, best_mode  # scipy, which the worker starts without
-    from worker.ml.filters.variations import variation
+    from worker.ml.filters.fitting.response_surface import (  # scipy, which the worker starts without
+        ResponseSurface,
+        best_mode,
+    )
+    from worker.ml.filters.fitting.variations import variation
 
     model, described = load_reward_model(stored_model), registry.task(task)
     if not isinstance(model, StructuredReward) or not surface_file(task).exists():

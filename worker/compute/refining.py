@@ -9,8 +9,8 @@ import torch
 
 from worker.compute.learning import run_scenarios
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_problem import FilterProblem
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterProblem
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again, go_on_from
 from worker.ml.reinforcement.refinement import Beginning, Refinement, refine, refine_ahead
 from worker.tasks import registry

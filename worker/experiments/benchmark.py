@@ -29,7 +29,7 @@ from worker.domain.trajectory import COSTS
 from worker.experiments import benchmark_cell
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
 from worker.experiments.rollout_cache import RolloutCache, policy_mark
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.methods.latent_people import Latent
 from worker.ml.methods.pbrl_hri import FromScratch
 from worker.ml.methods.prefft import FineTuning

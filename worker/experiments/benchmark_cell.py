@@ -29,8 +29,8 @@ from worker.domain.type_aliases import Act, FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
 from worker.experiments.rollout_cache import BEHAVIOURS_PER_SCENARIO, RolloutCache, policy_mark
 from worker.ml import acquisition
-from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import registry as methods
 from worker.ml.methods.people import Labels
 from worker.ml.methods.registry import MethodConfig, Setting

@@ -26,8 +26,8 @@ from worker.domain.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, f
 from worker.domain.task import Task
 from worker.domain.type_aliases import FloatArray
 from worker.experiments import lab_ranges
-from worker.ml.filters import response_surface
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting import response_surface
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
 from worker.sim.costs import signal_weights

@@ -9,7 +9,7 @@ the regret to zero; a regret that is small already is not worth anybody's time.
 import numpy as np
 
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface
+from worker.ml.filters.fitting.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface
 
 CANDIDATES = 4_000
 """Modes that are tried, the same for every member and at every retraining."""

@@ -10,8 +10,8 @@ import pytest
 from tests.worker import invented
 from worker.analysis.filters.promise import BATCH, Outcome, Promise, counted, harms, sentence
 from worker.compute.harm_tests import STRENGTHS, weakened_until_promised
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 
 PROMISE = Promise()
 CALM, PRESSED = Outcome(2.0, 0.0, True), Outcome(9.0, 0.0, True)

@@ -18,9 +18,9 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.rewards.reward_models import StructuredReward
 
 

@@ -13,9 +13,9 @@ from worker.compute import filter_finishing, filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.domain.trajectory import SIGNALS, Trajectory
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.reinforcement.refinement import Refinement
 from worker.ml.rewards.reward_models import StructuredReward

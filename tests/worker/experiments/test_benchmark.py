@@ -13,7 +13,7 @@ from worker.commands import options
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection
 from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
 

@@ -8,7 +8,7 @@ import pytest
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.tasks import registry
 
 FEEDING = registry.task("feeding")

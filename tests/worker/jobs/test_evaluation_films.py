@@ -31,7 +31,7 @@ from worker.jobs.learning.baselines import train_method
 from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.methods import prefft
 from worker.ml.rewards.reward_models import StructuredReward
 

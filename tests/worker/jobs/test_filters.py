@@ -34,8 +34,8 @@ from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.policies.checkpoint import PAUSE_FILE, Abandoned, Checkpoint, ask_to_pause, begin_again
 from worker.ml.reinforcement.refinement import Refinement
 

@@ -30,8 +30,8 @@ from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_lending, records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 
 FITTED = b"a controller"
 DONOR = FilterWeights(mode={"speed_far": 0.8}).to_bytes()

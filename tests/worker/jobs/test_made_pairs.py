@@ -32,7 +32,7 @@ from worker.jobs.learning import dataset, query_selection
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.tasks import registry
 

@@ -29,7 +29,7 @@ from worker.jobs.learning.baselines import train_method
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export.run_controller import Controller
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.tasks import registry
 
 MODE = {"speed_far": 0.3, "speed_near": -0.6, "from_below": 0.0, "to_side": 0.6, "press": 0.0}

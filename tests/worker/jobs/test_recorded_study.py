@@ -25,8 +25,8 @@ from worker.jobs.learning import reward_models
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.prior import Prior
 from worker.ml.rewards.reward_models import StructuredReward

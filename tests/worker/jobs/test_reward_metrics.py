@@ -16,7 +16,7 @@ from worker.compute.simulation import surface_file
 from worker.domain.trajectory import COSTS, SIGNALS
 from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime.context import WorkerContext
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.stopping import relative_regret
 from worker.tasks.registry import task

@@ -20,10 +20,10 @@ from worker.domain.type_aliases import Act
 from worker.ml.export import blinded_controller
 from worker.ml.export.blinded_controller import Blinded
 from worker.ml.export.run_controller import Controller
-from worker.ml.filters.action_encoder import ResidualAdapter
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights, build, state_of
-from worker.ml.filters.pbarl_printed import PrintedEncoder
+from worker.ml.filters.encoders.action_encoder import ResidualAdapter
+from worker.ml.filters.encoders.pbarl_printed import PrintedEncoder
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights, build, state_of
 from worker.ml.methods.best_of_n import BestOfN
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.reinforcement.preference_rl import PolicyAct

@@ -24,9 +24,9 @@ from worker.domain.trajectory import SIGNALS
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps
 from worker.ml.export.model_card import model_card
-from worker.ml.filters import shield
-from worker.ml.filters.filter_module import FilterWeights, build
-from worker.ml.filters.filter_onnx import to_onnx
+from worker.ml.filters.exported import shield
+from worker.ml.filters.exported.filter_module import FilterWeights, build
+from worker.ml.filters.exported.filter_onnx import to_onnx
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.policy_onnx import policy_to_onnx
 from worker.ml.rewards import reward_training

@@ -10,9 +10,9 @@ import torch
 
 from tests.worker import invented
 from worker.domain.modes import ApproachModes
-from worker.ml.filters.action_encoder import REACH, ResidualAdapter
-from worker.ml.filters.filter_module import ActionFilter, FilterWeights, build, state_of
-from worker.ml.filters.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
+from worker.ml.filters.encoders.action_encoder import REACH, ResidualAdapter
+from worker.ml.filters.exported.filter_module import ActionFilter, FilterWeights, build, state_of
+from worker.ml.filters.exported.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policies.torch_module import FrozenPolicy
 
 POLICY = invented.small_policy()
@@ -124,7 +124,7 @@ def test_filters_of_tasks_of_the_same_sizes_can_be_exported_at_once_each_by_its_
 
 
 def test_an_export_that_differs_is_not_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.ml.filters.filter_onnx.LARGEST_DIFFERENCE", -1.0)
+    monkeypatch.setattr("worker.ml.filters.exported.filter_onnx.LARGEST_DIFFERENCE", -1.0)
     with pytest.raises(ExportDiffers, match="largest difference"):
         to_onnx(build(FAMILY, POLICY, FilterWeights(mode=MODE)), SEEN, MEANS)
 

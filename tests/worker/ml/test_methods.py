@@ -15,10 +15,10 @@ from tests.worker.ml.invented_person import InventedPerson
 from worker.compute import learning
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import response_surface
-from worker.ml.filters.filter_module import load_state
-from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
-from worker.ml.filters.fitted_q import ActionValue
+from worker.ml.filters.encoders.fitted_q import ActionValue
+from worker.ml.filters.exported.filter_module import load_state
+from worker.ml.filters.fitting import response_surface
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.methods import prefft, registry
 from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
 from worker.ml.methods.latent_people import Latent

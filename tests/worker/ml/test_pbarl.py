@@ -13,13 +13,13 @@ from worker.compute import learning
 from worker.domain.scenarios import GATE, first_of
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import mode_search, pbarl, residual, response_surface
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterConfig, FilterProblem
-from worker.ml.filters.residual import learn_round
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting import mode_search, pbarl, residual, response_surface
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.residual import learn_round
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
 
 POLICY = invented.small_policy()

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from tests.worker import invented
 from worker.domain.trajectory import SIGNALS
-from worker.ml.filters import pbarl_printed
-from worker.ml.filters.filter_module import build
-from worker.ml.filters.filter_problem import FilterProblem
-from worker.ml.filters.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
-from worker.ml.filters.printed_filter import fit_printed
+from worker.ml.filters.encoders import pbarl_printed
+from worker.ml.filters.encoders.pbarl_printed import PrintedConfig, PrintedEncoder, reconstruction_loss
+from worker.ml.filters.exported.filter_module import build
+from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.printed_filter import fit_printed
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.reward_models import StructuredReward

@@ -13,10 +13,10 @@ from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, STEPS, World, collect
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Collect, FilterConfig, FilterProblem
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem
 from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again, go_on_from
 from worker.ml.reinforcement import refinement, refinement_gate
 from worker.ml.reinforcement.guided_reward import guided

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worker.domain.trajectory import SIGNALS
-from worker.ml.filters.response_surface import ResponseSurface, best_mode, fit, monomials
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode, fit, monomials
 from worker.tasks.feeding.environment import FEEDING
 
 FAMILY = FEEDING.modes

@@ -12,7 +12,7 @@ from tests.worker.ml.invented_person import InventedPerson
 from tests.worker.ml.test_methods import POLICY, REWARD, World, collect
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act, FloatArray
-from worker.ml.filters.filter_problem import FilterProblem
+from worker.ml.filters.fitting.filter_problem import FilterProblem
 from worker.ml.methods import bayesian_modes, clusters, latent_people, residual_rl, sliders
 from worker.ml.methods.behaviour_flow import fit_flow
 from worker.ml.methods.dsrl import OwnNoise

@@ -10,10 +10,10 @@ import torch
 
 from tests.worker import invented
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_module import FilterWeights, build
-from worker.ml.filters.filter_onnx import OnnxFilter, largest_difference, to_onnx
-from worker.ml.filters.shield import FORCE_RAMP_N, described, limits_of
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights, build
+from worker.ml.filters.exported.filter_onnx import OnnxFilter, largest_difference, to_onnx
+from worker.ml.filters.exported.shield import FORCE_RAMP_N, described, limits_of
 
 POLICY = invented.small_policy()
 TASK = invented.TASK

@@ -8,11 +8,19 @@ import torch
 
 from tests.worker import invented
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters import filter_onnx
-from worker.ml.filters.filter_act import act_of, trace
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.shield import untried
-from worker.ml.filters.touch_limit import LEAST_STEPS, NAMES, NEAR_M, TOUCH_N, USUAL_TOUCH, TouchLimit, touch_limits
+from worker.ml.filters.exported import filter_onnx
+from worker.ml.filters.exported.filter_act import act_of, trace
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import untried
+from worker.ml.filters.exported.touch_limit import (
+    LEAST_STEPS,
+    NAMES,
+    NEAR_M,
+    TOUCH_N,
+    USUAL_TOUCH,
+    TouchLimit,
+    touch_limits,
+)
 
 SPACE = invented.TASK.observation
 FORCE, TO_TARGET, OUTWARD = (

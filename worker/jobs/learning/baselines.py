@@ -31,7 +31,7 @@ from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
 

@@ -9,8 +9,8 @@ from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_problem import FilterConfig
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 
 _BEFORE, _AFTER = 0.15, 0.7
 """How far a fit is before its refinement and after it."""

@@ -9,7 +9,7 @@ from worker.compute.pools import Computing, Lane
 from worker.domain.scenarios import EVALUATION, first_of, of_promise
 from worker.domain.trajectory import Trajectory
 from worker.jobs.learning.fits import filter_config, promise_of
-from worker.ml.filters import filter_act
+from worker.ml.filters.exported import filter_act
 from worker.tasks import registry
 
 

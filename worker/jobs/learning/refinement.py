@@ -27,7 +27,7 @@ from worker.jobs.learning import dataset, fits, patience, reward_models
 from worker.jobs.runtime import due_work, records
 from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
-from worker.ml.filters.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.policies.checkpoint import Abandoned, go_on_from
 from worker.ml.reinforcement.refinement import Refinement
 

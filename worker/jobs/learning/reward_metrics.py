@@ -12,7 +12,7 @@ from worker.domain.trajectory import COSTS
 from worker.domain.type_aliases import FloatArray
 from worker.jobs.learning import dataset
 from worker.jobs.runtime.context import WorkerContext
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch

@@ -23,8 +23,8 @@ from worker.domain.type_aliases import Act, Float32Array
 from worker.ml.export import run_controller
 from worker.ml.export.bundle import described_space
 from worker.ml.export.run_controller import INPUT, OUTPUT, Controller
-from worker.ml.filters.filter_act import FilterAct
-from worker.ml.filters.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers, OnnxFilter
+from worker.ml.filters.exported.filter_act import FilterAct
+from worker.ml.filters.exported.filter_onnx import LARGEST_DIFFERENCE, ExportDiffers, OnnxFilter
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.policy_onnx import IR_VERSION, OPSET
 from worker.ml.policies.reference import ReferencePolicy

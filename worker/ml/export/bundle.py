@@ -24,9 +24,9 @@ from worker.domain.type_aliases import Float32Array
 from worker.ml.export import filter_loop, run_filter, serve_filter
 from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
-from worker.ml.filters import shield
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_onnx import INPUTS, OUTPUT, SHIELD, OnnxFilter
+from worker.ml.filters.exported import shield
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_onnx import INPUTS, OUTPUT, SHIELD, OnnxFilter
 from worker.ml.policies import policy_client
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.reference import ReferencePolicy

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.filter_module import state_of
-from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter
+from worker.ml.filters.encoders.fitted_q import ActionValue, Transitions, evaluate_filter
+from worker.ml.filters.exported.filter_module import state_of
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.reward_models import RewardModel

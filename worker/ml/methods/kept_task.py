@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Collect, FilterProblem
-from worker.ml.filters.gate import keeps_task, try_on
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.gate import keeps_task, try_on
 
 
 def in_mode(problem: FilterProblem, mode: FloatArray, gate: float = 1.0) -> FilterAct:

@@ -16,8 +16,8 @@ import torch
 from worker.domain.spaces import Space
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.filter_problem import Collect
-from worker.ml.filters.gate import successes
+from worker.ml.filters.fitting.filter_problem import Collect
+from worker.ml.filters.fitting.gate import successes
 from worker.ml.methods import prefft
 from worker.ml.methods.prefft import FineTuning
 from worker.ml.policies.gaussian import GaussianPolicy

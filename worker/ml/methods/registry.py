@@ -19,12 +19,13 @@ from app.installed_tasks.refinements import answers_ahead
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters import filter_act, mode_search, pbarl
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_problem import Collect, FilterProblem
-from worker.ml.filters.pbarl_printed import PrintedConfig
-from worker.ml.filters.printed_filter import fit_printed
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.encoders.pbarl_printed import PrintedConfig
+from worker.ml.filters.exported import filter_act
+from worker.ml.filters.fitting import mode_search, pbarl
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.printed_filter import fit_printed
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import (
     bayesian_modes,
     clusters,

@@ -12,7 +12,7 @@ import numpy as np
 
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 from worker.ml.methods.kept_task import in_mode
 from worker.ml.methods.people import Person
 

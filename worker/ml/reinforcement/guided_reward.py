@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.shield import FORCE_QUANTILE, FORCE_RAMP_N
+from worker.ml.filters.exported.shield import FORCE_QUANTILE, FORCE_RAMP_N
 from worker.ml.reinforcement.preference_rl import EpisodeReward
 
 MOST_RAMPS = 3.0

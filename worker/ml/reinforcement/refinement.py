@@ -17,10 +17,10 @@ import torch
 from app.installed_tasks.refinements import SHARE_AHEAD
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_problem import Collect, FilterProblem
-from worker.ml.filters.gate import keeps_task, to_beat
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.gate import keeps_task, to_beat
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.demonstrations import Demonstrations
 from worker.ml.policies.imitation import imitate

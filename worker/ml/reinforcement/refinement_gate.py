@@ -6,11 +6,11 @@ from dataclasses import replace
 from itertools import product
 
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_problem import Collect, FilterProblem, ReportProgress
-from worker.ml.filters.gate import keeps_task, to_beat, try_on
-from worker.ml.filters.shield import limits_of
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.shield import limits_of
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.gate import keeps_task, to_beat, try_on
 
 _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "

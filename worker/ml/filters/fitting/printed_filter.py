@@ -4,11 +4,11 @@ import time
 from collections.abc import Sequence
 
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_module import FilterWeights, state_of
-from worker.ml.filters.filter_problem import FilterProblem, ReportProgress
-from worker.ml.filters.fitted_q import Transitions
-from worker.ml.filters.pbarl_printed import PrintedConfig, train
+from worker.ml.filters.encoders.fitted_q import Transitions
+from worker.ml.filters.encoders.pbarl_printed import PrintedConfig, train
+from worker.ml.filters.exported.filter_module import FilterWeights, state_of
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterProblem, ReportProgress
 from worker.ml.policies.reference import looked_into
 from worker.ml.rewards.action_ranking import ranker_at
 

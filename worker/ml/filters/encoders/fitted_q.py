@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from worker.ml.filters.action_encoder import OBSERVATION_CLIP
+from worker.ml.filters.encoders.action_encoder import OBSERVATION_CLIP
 
 DISCOUNT = 0.97
 POLYAK = 0.01

@@ -7,8 +7,8 @@ import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 
 
 def try_on(

@@ -7,11 +7,11 @@ Every stage takes a draft and returns a better one.
 from collections.abc import Callable, Sequence
 
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.filter_draft import FilterDraft
-from worker.ml.filters.filter_problem import Collect, FilterProblem, ReportProgress
-from worker.ml.filters.mode_search import find_mode
-from worker.ml.filters.residual import gate_residual, train_residual
-from worker.ml.filters.response_surface import ResponseSurface
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.mode_search import find_mode
+from worker.ml.filters.fitting.residual import gate_residual, train_residual
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 
 
 def fit_studio(

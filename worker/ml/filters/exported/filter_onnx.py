@@ -18,7 +18,7 @@ import torch
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.filter_module import AnyFilter
+from worker.ml.filters.exported.filter_module import AnyFilter
 
 INPUTS = ("observation", "policy_mean")
 OUTPUT, SHIELD = "action", "shield"

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.filter_module import FilterWeights
+from worker.ml.filters.exported.filter_module import FilterWeights
 
 _VALUE, _TESTED = "value/", "tested/"
 

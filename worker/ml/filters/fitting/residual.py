@@ -11,14 +11,14 @@ from torch import Tensor
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
-from worker.ml.filters.action_encoder import ResidualAdapter, kl_divergence
-from worker.ml.filters.filter_act import act_of
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import ModeTransform, load_state, state_of
-from worker.ml.filters.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
-from worker.ml.filters.gate import acceptable, to_beat, try_on
-from worker.ml.filters.shield import limits_of
+from worker.ml.filters.encoders.action_encoder import ResidualAdapter, kl_divergence
+from worker.ml.filters.encoders.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import ModeTransform, load_state, state_of
+from worker.ml.filters.exported.shield import limits_of
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.gate import acceptable, to_beat, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]

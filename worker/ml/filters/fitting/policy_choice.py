@@ -14,10 +14,10 @@ import numpy as np
 from app.installed_tasks.lab import REFERENCE
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import FilterProblem
-from worker.ml.filters.gate import keeps_task, trial_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.gate import keeps_task, trial_of
 from worker.ml.rewards.reward_models import RewardModel
 
 DRAWS = 4000

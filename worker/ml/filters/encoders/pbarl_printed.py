@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from worker.ml.filters.action_encoder import kl_divergence
-from worker.ml.filters.fitted_q import Transitions
+from worker.ml.filters.encoders.action_encoder import kl_divergence
+from worker.ml.filters.encoders.fitted_q import Transitions
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.torch_module import FrozenPolicy
 from worker.ml.rewards.action_ranking import Ranker, RankerAt

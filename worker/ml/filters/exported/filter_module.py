@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from worker.domain.modes import ModeFamily
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.action_encoder import ResidualAdapter
-from worker.ml.filters.pbarl_printed import PrintedEncoder
-from worker.ml.filters.shield import Shield
+from worker.ml.filters.encoders.action_encoder import ResidualAdapter
+from worker.ml.filters.encoders.pbarl_printed import PrintedEncoder
+from worker.ml.filters.exported.shield import Shield
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.policies.torch_module import FrozenPolicy

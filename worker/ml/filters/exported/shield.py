@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters import touch_limit
-from worker.ml.filters.touch_limit import DISTANCE, FORCE, NAMES, TouchLimit, length, touch_limits
+from worker.ml.filters.exported import touch_limit
+from worker.ml.filters.exported.touch_limit import DISTANCE, FORCE, NAMES, TouchLimit, length, touch_limits
 
 RAMP = 0.25
 """of a range's width, behind which the filter is off"""

@@ -8,11 +8,11 @@ import torch
 
 from worker.domain.modes import ModeFamily
 from worker.domain.type_aliases import Float32Array
-from worker.ml.filters.action_encoder import ResidualAdapter
-from worker.ml.filters.filter_module import FilterWeights, build, state_of
-from worker.ml.filters.filter_onnx import OnnxFilter, to_onnx
-from worker.ml.filters.shield import widest
-from worker.ml.filters.touch_limit import NAMES
+from worker.ml.filters.encoders.action_encoder import ResidualAdapter
+from worker.ml.filters.exported.filter_module import FilterWeights, build, state_of
+from worker.ml.filters.exported.filter_onnx import OnnxFilter, to_onnx
+from worker.ml.filters.exported.shield import widest
+from worker.ml.filters.exported.touch_limit import NAMES
 from worker.ml.policies.asked_policy import AskedPolicy
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy

@@ -7,13 +7,13 @@ import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.filter_act import FilterAct, act_of
-from worker.ml.filters.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.filter_module import FilterWeights
-from worker.ml.filters.filter_problem import Collect, FilterProblem, ReportProgress
-from worker.ml.filters.gate import acceptable, signal_changes, successes, try_on
-from worker.ml.filters.response_surface import CAUTION, ResponseSurface, best_mode
-from worker.ml.filters.shield import limits_of, untried
+from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import limits_of, untried
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.gate import acceptable, signal_changes, successes, try_on
+from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import StructuredReward
 
 

@@ -1,0 +1,1 @@
+"""Action encoders, and what an action is worth."""

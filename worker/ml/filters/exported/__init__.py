@@ -1,0 +1,1 @@
+"""What of it runs on a robot: filter.onnx."""

@@ -1,0 +1,1 @@
+"""How one is found for a person, and gated."""
