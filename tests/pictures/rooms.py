@@ -157,17 +157,20 @@ def _column(program: str, left: float, top: float) -> tuple[float, list[str]]:
     return top, drawn
 
 
-def _notes(loads: Mapping[str, Sequence[str]], left: float, top: float) -> Iterator[str]:
-    yield f'<text class="ink" x="{left:g}" y="{top:g}">Who imports what</text>'
+def _notes(loads: Mapping[str, Sequence[str]], left: float, top: float) -> tuple[float, list[str]]:
+    """Where they end, and what to draw."""
+    drawn = [f'<text class="ink" x="{left:g}" y="{top:g}">Who imports what</text>']
     for library, rooms in loads.items():
-        top += 18
-        short = "; ".join(
+        whole = "; ".join(
             f"{program}: " + ", ".join(name.partition(".")[2] for name in own)
             for program in PROGRAMS
             if (own := [name for name in rooms if name.startswith(program)])
         )
-        yield f'<text class="name modules muted" x="{left:g}" y="{top:g}">{library}</text>'
-        yield f'<text class="muted" x="{left + NAME_WIDTH:g}" y="{top:g}">{short}</text>'
+        drawn.append(f'<text class="name modules muted" x="{left:g}" y="{top + 18:g}">{library}</text>')
+        for line in textwrap.wrap(whole, LONGEST_LINE):
+            top += 18
+            drawn.append(f'<text class="muted" x="{left + NAME_WIDTH:g}" y="{top:g}">{line}</text>')
+    return top, drawn
 
 
 def picture() -> str:
@@ -177,8 +180,8 @@ def picture() -> str:
         *(_column(program, MARGIN + index * (COLUMN + MARGIN), 76) for index, program in enumerate(PROGRAMS)),
         strict=True,
     )
-    notes = list(_notes({name: list(loaded_by(name)) for name in ("app", *LIBRARIES)}, MARGIN, min(ends) + 24))
-    tall = max(*ends, min(ends) + 24 + 18 * (len(LIBRARIES) + 1)) + MARGIN
+    end, notes = _notes({name: list(loaded_by(name)) for name in ("app", *LIBRARIES)}, MARGIN, ends[0] + 24)
+    tall = max(*ends, end) + MARGIN
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {tall:g}" width="{WIDTH}" role="img">',
         "<title>The rooms of PbARL Studio</title>",
