@@ -17,17 +17,17 @@ from worker.ml.filters.exported.touch_limit import (
     NAMES,
     NEAR_M,
     TOUCH_N,
-    USUAL_TOUCH,
+    USUAL,
     TouchLimit,
     touch_limits,
 )
 
 SPACE = invented.TASK.observation
-FORCE, TO_TARGET, OUTWARD = (
-    SPACE.slice_of(name) for name in ("force_on_person_n", "tool_to_target_m", "target_outward")
+FORCE, TO_TARGET, OUTWARD, JOINTS = (
+    SPACE.slice_of(name) for name in ("force_on_person_n", "tool_to_target_m", "target_outward", "joint_positions_rad")
 )
-MOTION_M = np.random.default_rng(5).uniform(-0.02, 0.02, (invented.A, 3))
-"""Of the tool in one step, by the numbers of the action."""
+MOTION_M, TURNED_M = np.random.default_rng(5).uniform(-0.02, 0.02, (2, invented.A, 3))
+"""Of the tool in one step, by the numbers of the action; the second times the angle of the first joint."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -40,9 +40,9 @@ def approach(seed: int, noise_m: float = 0.0, steps: int = 40) -> Trajectory:
         seen[step, TO_TARGET], seen[step, OUTWARD] = -tool, UP
         seen[step, FORCE] = 100.0 * max(0.0, -tool[2])
         if step < steps:
-            some = rng.uniform(-1, 1, (4, invented.A))
-            actions[step] = some[np.linalg.norm(tool + some @ MOTION_M, axis=1).argmin()]
-            tool = tool + actions[step] @ MOTION_M + noise_m * rng.standard_normal(3)
+            some, motion_m = rng.uniform(-1, 1, (4, invented.A)), MOTION_M + seen[step, JOINTS][0] * TURNED_M
+            actions[step] = some[np.linalg.norm(tool + some @ motion_m, axis=1).argmin()]
+            tool = tool + actions[step] @ motion_m + noise_m * rng.standard_normal(3)
     return replace(episode, observations=seen.astype(np.float32), actions=actions.astype(np.float32))
 
 
@@ -65,10 +65,11 @@ def limited(height_m: float, action: np.ndarray, beside_m: float = 0.0) -> tuple
     return left.numpy()[0].astype(np.float64), float(share)
 
 
-def motion(action: np.ndarray) -> np.ndarray:
-    """Of the tool, as was learned."""
+def motion(action: np.ndarray, joints: np.ndarray | float = 0.0) -> np.ndarray:
+    """Of the tool, as was learned; with all joints at zero if not said."""
     learned = LIMITS["touch_motion"].astype(np.float64)
-    moved: np.ndarray = action @ learned[:-1] + learned[-1]
+    coefficients = np.einsum("j,jai->ai", np.append(np.broadcast_to(joints, invented.A), 1.0), learned)
+    moved: np.ndarray = np.append(action, 1.0) @ coefficients
     return moved
 
 
@@ -76,18 +77,22 @@ INWARD = -np.sign(MOTION_M[:, 2])
 """The action that goes straight for the skin."""
 
 
-def test_how_actions_move_the_tool_is_learned_from_steps_without_a_touch() -> None:
-    np.testing.assert_allclose(LIMITS["touch_motion"][:-1], MOTION_M, atol=2e-3)
+def test_how_actions_move_the_tool_is_learned_for_every_posture_of_the_arm() -> None:
+    learned = LIMITS["touch_motion"]
+    np.testing.assert_allclose(learned[-1, :-1], MOTION_M, atol=2e-4)
+    np.testing.assert_allclose(learned[0, :-1], TURNED_M, atol=1e-3)
+    np.testing.assert_allclose(learned[1:-1], 0.0, atol=1e-3)
 
 
 def test_the_depth_is_that_of_usual_touches() -> None:
     depths = []
     for episode in REFERENCE:
         seen = episode.observations.astype(np.float64)
-        free = (seen[:-1, FORCE.start] < TOUCH_N) & (np.linalg.norm(seen[:-1, TO_TARGET], axis=1) <= NEAR_M)
-        ends = seen[:-1, TO_TARGET][:, 2] - np.array([motion(action)[2] for action in episode.actions])
-        depths += [*ends[free & (seen[1:, FORCE.start] >= TOUCH_N)]]
-    assert LIMITS["touch_depth"][0] == pytest.approx(np.quantile(depths, USUAL_TOUCH), abs=1e-5)
+        moved = [motion(*each) for each in zip(episode.actions, seen[:-1, JOINTS], strict=True)]
+        ends = seen[:-1, TO_TARGET][:, 2] - np.array(moved)[:, 2]
+        near = np.linalg.norm(seen[:-1, TO_TARGET], axis=1) <= NEAR_M
+        depths += [*ends[near & (seen[1:, FORCE.start] >= TOUCH_N)]]
+    assert LIMITS["touch_depth"][0] == pytest.approx(np.quantile(depths, USUAL), abs=1e-5)
 
 
 def test_of_a_blow_only_what_leads_too_deep_is_taken_back() -> None:
@@ -95,7 +100,7 @@ def test_of_a_blow_only_what_leads_too_deep_is_taken_back() -> None:
     assert motion(INWARD)[2] < -deepest - 0.01, "a blow"
     left, share = limited(0.01, INWARD)
     assert -(0.01 + motion(left)[2]) == pytest.approx(deepest, abs=1e-5)
-    away = LIMITS["touch_motion"][:-1, 2] / np.linalg.norm(LIMITS["touch_motion"][:-1, 2])
+    away = LIMITS["touch_motion"][-1, :-1, 2] / np.linalg.norm(LIMITS["touch_motion"][-1, :-1, 2])
     taken = INWARD - left
     np.testing.assert_allclose(taken, away * (away @ taken), atol=1e-5)
     assert share == pytest.approx(np.linalg.norm(taken) / np.linalg.norm(INWARD), rel=1e-4)
@@ -112,7 +117,7 @@ def test_who_leaves_or_is_not_there_yet_is_let_alone(height_m: float, action: np
 
 def test_nothing_is_limited_by_what_cannot_be_foretold() -> None:
     assert not touch_limits(SPACE, [approach(seed, noise_m=0.05) for seed in range(30)])
-    assert not touch_limits(SPACE, [approach(1, steps=LEAST_STEPS // 2)])
+    assert not touch_limits(SPACE, [approach(1, steps=LEAST_STEPS - 1)])
     assert not touch_limits(SPACE, [touched_anywhere(episode) for episode in REFERENCE]), "as by the rim of a cup"
 
 

@@ -103,12 +103,13 @@ def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
     sizes = {"observation": observation.size, "change": action_size}
     ends = {"low": -1e6, "high": 1e6, "ramp": 1.0}
     limits = {f"{name}_{end}": np.full(size, ends[end], np.float32) for name, size in sizes.items() for end in ends}
-    if DISTANCE in [field.name for field in observation.fields]:
+    places = {field.name: place for field, place in observation.slices()}
+    if DISTANCE in places:
         limits["near_action"] = np.array([1e6, 1.0], np.float32)
-        limits |= {
-            "touch_motion": np.ones((action_size + 1, 3), np.float32),
-            "touch_depth": np.array([1e6], np.float32),
-        }
+    if places.keys() >= touch_limit.FIELDS:
+        joints = len(range(observation.size)[places[touch_limit.JOINTS]])
+        limits["touch_motion"] = np.ones((joints + 1, action_size + 1, 3), np.float32)
+        limits["touch_depth"] = np.array([1e6], np.float32)
     return limits
 
 
