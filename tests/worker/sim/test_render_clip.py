@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.worker.waving import itching_trajectory, pouring_trajectory, waving_trajectory
+from worker.compute import simulation
 from worker.domain.trajectory import Trajectory
 from worker.sim.arm import Tool
 from worker.sim.geometry import Shape, rotation_of
@@ -25,6 +26,7 @@ from worker.sim.render.mesh_set import MeshSet
 from worker.sim.render.passes import Shot
 from worker.sim.render.scene import Scene
 from worker.sim.render.task_look import TaskLook
+from worker.sim.rollout import rollout
 from worker.tasks.feeding.environment import SPOON
 from worker.tasks.registry import filmed_task, look
 from worker.tasks.scratching.environment import SCRATCHER
@@ -117,6 +119,15 @@ def test_two_clips_of_a_scenario_are_seen_from_the_same_place() -> None:
         other = replace(first, joint_positions=first.joint_positions + np.float32(0.1))
         cameras = {close_up(look(task), clip_motion(each, JACO, tool, 0, 3, 15), 208, 152) for each in (first, other)}
         assert len(cameras) == 1
+
+
+@pytest.mark.parametrize("scenario", [9_000_055, 9_000_136, 9_000_272])
+def test_no_shoulder_and_no_head_hides_an_itch_in_the_crook_of_the_elbow(renderer: ClipRenderer, scenario: int) -> None:
+    """Where the arm is dark, so that the itch is the only thing in the close-up that is as red."""
+    whole = rollout(simulation.environment("scratching"), lambda observation: np.zeros(7, np.float32), scenario)
+    first = np.asarray(next(renderer.pictures(whole, 0, 1))).astype(int)
+    red, green, _ = np.moveaxis(first[: first.shape[0] // 3, 2 * first.shape[1] // 3 :], -1, 0)
+    assert ((red > 100) & (red > 2.2 * green)).mean() > 0.004
 
 
 def test_what_lies_behind_a_camera_is_not_drawn_and_what_reaches_behind_it_is_drawn_whole() -> None:
