@@ -13,7 +13,7 @@ from app.domain.studies import Participant, Study
 from app.services.answers import consistency, exclusions
 from app.services.answers.accuracy import Share
 from app.services.evaluation import unblinding
-from app.services.exports import export_rows
+from app.services.exports import whose_rows
 from app.services.monitoring import form_summaries
 from app.services.monitoring.form_summaries import FormSummary, Summary
 from app.services.paper import recruitment
@@ -70,7 +70,7 @@ def _when(flow: Flow) -> str:
 
 
 def _visit(session: Session, study: Study) -> str:
-    people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
+    people = [each for each in whose_rows.everybody(session, study) if each.withdrawn_at is None]
     returned = [each for each in people if each.earlier_id is not None]
     return (
         f"This was a return visit: {len(returned)} of these {len(people)} had completed the study "
@@ -209,7 +209,7 @@ def _attention(session: Session, study: Study) -> str:
 
 def missed_catches(session: Session, study: Study) -> Sequence[Share]:
     """Of everybody who has answered a catch pair and not withdrawn: how many of them were wrong."""
-    people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
+    people = [each for each in whose_rows.everybody(session, study) if each.withdrawn_at is None]
     found = [consistency.catch_errors(consistency.answers_of(_answers(session, each))) for each in people]
     return [each for each in found if each is not None]
 

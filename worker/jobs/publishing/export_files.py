@@ -21,9 +21,9 @@ from app.services.exports import (
     codebook,
     export_formats,
     export_requests,
-    export_rows,
     export_tables,
     parquet_file,
+    whose_rows,
 )
 from app.services.exports.export_formats import RowProvenance, Table
 from app.services.exports.export_requests import ExportKind
@@ -169,7 +169,7 @@ def _write_pairs(
     target: zipfile.ZipFile, session: Session, context: WorkerContext, study: Study, missing: dict[str, list[str]]
 ) -> list[str]:
     written = []
-    for person in export_rows.everybody(session, study):
+    for person in whose_rows.everybody(session, study):
         lost = set[str]()
         arrays = preference_arrays.arrays_of(session, context.store, study, person, lost)
         if lost:
@@ -199,7 +199,7 @@ def _provenance(session: Session, study: Study, provenance: RowProvenance) -> di
             | {"before": each.before, "after": each.after}
             for each in deviations
         ],
-        "scripted": {each.code: each.scripted_as for each in export_rows.everybody(session, study) if each.scripted_as},
+        "scripted": {each.code: each.scripted_as for each in whose_rows.everybody(session, study) if each.scripted_as},
         "plan_in_words": preregistration.plan_of(session, study).in_words,
         "blinded": unblinding.is_blinded(study),
         "unblinded_at": study.unblinded_at.isoformat() if study.unblinded_at else None,

@@ -6,14 +6,14 @@ from sqlalchemy.orm import Session
 
 from app.domain.studies import Study
 from app.services.evaluation import unblinding
-from app.services.exports import export_formats, export_rows
+from app.services.exports import export_formats, whose_rows
 from worker.jobs.publishing.scripted_words import scripted_in_words
 
 
 def card(session: Session, study: Study, tables: Sequence[str], with_preferences: bool) -> str:
     """README.md of the dataset, with ``configs`` so that load_dataset opens it."""
     provenance = export_formats.provenance_of(session, study)
-    scripted = {each.code: each.scripted_as for each in export_rows.everybody(session, study) if each.scripted_as}
+    scripted = {each.code: each.scripted_as for each in whose_rows.everybody(session, study) if each.scripted_as}
     parts = {"default": "data/*/*.parquet"}
     parts |= {"preferences": "preferences/*.parquet"} if with_preferences else {}
     parts |= {table: f"tables/{table}.parquet" for table in tables}

@@ -22,7 +22,7 @@ from sqlalchemy.orm import Session, contains_eager
 from app.domain.clips import Clip, Rollout
 from app.domain.studies import Study
 from app.errors import AppError
-from app.services.exports import export_formats, export_rows, export_tables, parquet_file
+from app.services.exports import export_formats, export_tables, parquet_file, whose_rows
 from app.storage import ArtefactMissing
 from worker.domain.responses import TARGETS
 from worker.jobs.learning import dataset
@@ -309,7 +309,7 @@ def _preferences(session: Session, study: Study, place: Mapping[int, int]) -> li
             "left_episode": place[label.query.left_clip_id],
             "right_episode": place[label.query.right_clip_id],
         }
-        for person in export_rows.everybody(session, study)
+        for person in whose_rows.everybody(session, study)
         for label in dataset.labels_with_clips(session, person.id)
         if {label.query.left_clip_id, label.query.right_clip_id} <= place.keys()
     ]

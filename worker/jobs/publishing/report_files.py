@@ -24,7 +24,7 @@ from app.questionnaires import library
 from app.questionnaires.library import Instrument
 from app.services.answers import accuracy, answer_figures, form_answers
 from app.services.evaluation import evaluation_plan, unblinding
-from app.services.exports import export_formats, export_rows, export_tables
+from app.services.exports import export_formats, export_tables, whose_rows
 from app.services.participants import forms, withdrawal
 from app.services.runs.reports import VERSION
 from app.services.studies import preregistration
@@ -126,7 +126,7 @@ def tables_of(session: Session, study: Study) -> Tables:
     wanted = {name: export_tables.BY_NAME[name] for name in ("ratings", "evaluations", "headtoheads")}
     provenance = export_formats.provenance_of(session, study)
     rows = {name: list(export_formats.records(table, session, study, provenance)) for name, table in wanted.items()}
-    people = [each for each in export_rows.everybody(session, study) if each.withdrawn_at is None]
+    people = [each for each in whose_rows.everybody(session, study) if each.withdrawn_at is None]
     return Tables(
         participants=[each.code for each in people],
         answers=[answer_figures.figures_of(session, each) for each in people],
@@ -150,7 +150,7 @@ def _instruments(session: Session, study: Study) -> list[dict[str, Any]]:
     """Every standard questionnaire of the study with what everybody filled in; about a robot by method or letter."""
     methods = None if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in study.settings.all_instruments}
-    for person in export_rows.everybody(session, study):
+    for person in whose_rows.everybody(session, study):
         for each in form_answers.filled_in(session, person.id) if person.withdrawn_at is None else ():
             group = each.letter if methods is None or each.letter is None else methods.get((person.id, each.letter))
             keyed = {item.name: each.instrument.keyed(item.name, each.answers) for item in each.instrument.items}
@@ -178,7 +178,7 @@ def _guesses(session: Session, study: Study) -> list[dict[str, Any]]:
     """Who named which robot as theirs, and whether it is; that is None while the study is blinded."""
     methods = {} if unblinding.is_blinded(study) else unblinding.methods_by_letter(session, study)
     found = []
-    for person in export_rows.everybody(session, study):
+    for person in whose_rows.everybody(session, study):
         letter = forms.answers_of(session, person, Stage.QUESTIONNAIRE).get(MADE_FOR_YOU)
         if person.withdrawn_at is None and letter is not None:
             method = methods.get((person.id, letter))

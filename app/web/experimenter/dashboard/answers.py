@@ -15,7 +15,7 @@ from app.domain.studies import Participant, Study
 from app.services import audit
 from app.services.answers import answers, exclusions
 from app.services.answers.answers import Mark, Wanted
-from app.services.exports import export_rows
+from app.services.exports import whose_rows
 from app.services.participants import enrolment
 from app.services.studies import studies
 from app.web.http.authorized_route import AuthorizedRoute
@@ -62,7 +62,7 @@ def show_answers(
 ) -> Response:
     """The answers that are wanted, page by page."""
     study = studies.find_study(session, slug)
-    people = export_rows.everybody(session, study)
+    people = whose_rows.everybody(session, study)
     person = next((each for each in people if each.code == wanted.code), None)
     _note_looking(studio, session, experimenter, study, person)
     context = {

@@ -10,7 +10,7 @@ from starlette.background import BackgroundTask
 
 from app.domain.people import Experimenter
 from app.domain.studies import Study
-from app.services.exports import export_rows
+from app.services.exports import whose_rows
 from app.services.studies import retirement, studies
 from app.web.http.authorized_route import AuthorizedRoute
 from app.web.http.deps import (
@@ -78,7 +78,7 @@ def _page(
     context = {
         "study": study,
         "experimenter": experimenter,
-        "people": len(export_rows.everybody(session, study)),
+        "people": len(whose_rows.everybody(session, study)),
         "may_delete": request.state.may_manage,
         "error": error,
     }

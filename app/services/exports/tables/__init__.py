@@ -1,0 +1,1 @@
+"""Each table: columns, and the rows in it."""
