@@ -191,7 +191,7 @@ Every table and column of a study's export, with type, unit and meaning. Each ta
 while the study runs. One zip file has all of them as CSV, JSONL and Parquet, with this dictionary, the report's figures
 and the preference pairs as arrays (`docs/arrays.md`).
 
-This page is generated from `app/services/exports/export_tables.py` by `python -m app dictionary`; a test fails when it
+This page is generated from `app/services/exports/tables/` by `python -m app dictionary`; a test fails when it
 is out of date.
 
 * Files are UTF-8 without a byte order mark; CSV has a header line, commas, and double quotes where needed.
