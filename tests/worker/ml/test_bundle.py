@@ -260,7 +260,10 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     assert [output["name"] for output in manifest["onnx"]["outputs"]] == ["action", "shield"]
     (high, *_) = manifest["shield"]["limits"]["observation"][0]["high"]
     assert high == limits["observation_high"][0]
-    assert manifest["shield"]["limits"]["depth_of_step"]["deepest_m"] == limits["touch_depth"][0]
+    step = manifest["shield"]["limits"]["depth_of_step"]
+    assert step["deepest_m"] == limits["touch_depth"][0]
+    assert np.shape(step["tool_motion_m"]) == (8, 8, 3)
+    assert len(step["axes_of_tool_motion"]) == 3
     assert "active in 50.0% of the control steps" in card
     assert "not every blow is foreseen" in card
     assert sentence in card

@@ -152,5 +152,6 @@ def described(observation: Space, action: Space, limits: Mapping[str, Float32Arr
             "from_m": touch_limit.NEAR_M + touch_limit.COMING_NEAR_M,
         }
         motion, (deepest,) = limits["touch_motion"].tolist(), limits["touch_depth"].tolist()
-        found["depth_of_step"] |= {"deepest_m": deepest, "tool_motion_m_per_action": motion}
+        axes = ["joint angles in rad, and 1", "numbers of the action, and 1", "x, y, z"]
+        found["depth_of_step"] |= {"deepest_m": deepest, "tool_motion_m": motion, "axes_of_tool_motion": axes}
     return found
