@@ -57,10 +57,12 @@ REFERENCE = [approach(seed) for seed in range(30)]
 LIMITS = touch_limits(SPACE, REFERENCE)
 
 
-def limited(height_m: float, action: np.ndarray, beside_m: float = 0.0) -> tuple[np.ndarray, float]:
+def limited(
+    height_m: float, action: np.ndarray, beside_m: float = 0.0, joints_rad: float = 0.0
+) -> tuple[np.ndarray, float]:
     """What is left of an action of which the tool is so high above the skin, and the share that was taken."""
     seen = np.zeros((1, SPACE.size), np.float32)
-    seen[0, TO_TARGET], seen[0, OUTWARD] = (beside_m, 0.0, -height_m), UP
+    seen[0, TO_TARGET], seen[0, OUTWARD], seen[0, JOINTS] = (beside_m, 0.0, -height_m), UP, joints_rad
     left, share = TouchLimit(SPACE, LIMITS)(torch.from_numpy(seen), torch.from_numpy(action[None].astype(np.float32)))
     return left.numpy()[0].astype(np.float64), float(share)
 
@@ -113,6 +115,15 @@ def test_who_leaves_or_is_not_there_yet_is_let_alone(height_m: float, action: np
     left, share = limited(height_m, action, beside_m)
     np.testing.assert_array_equal(left, action.astype(np.float32))
     assert share == 0.0
+
+
+@pytest.mark.parametrize(("height_m", "joints_rad"), [(-0.05, 0.0), (0.01, 500.0), (-0.05, -0.9)])
+def test_no_more_is_taken_than_there_is(height_m: float, joints_rad: float) -> None:
+    """Deep in the person, or in postures for which nothing that was learned holds, a small step stays small."""
+    for action in 0.05 * np.random.default_rng(1).standard_normal((50, invented.A)):
+        left, share = limited(height_m, action, joints_rad=joints_rad)
+        assert np.linalg.norm(action - left) <= np.linalg.norm(action) * (1 + 1e-5)
+        assert 0.0 <= share <= 1.0
 
 
 def test_nothing_is_limited_by_what_cannot_be_foretold() -> None:

@@ -5,7 +5,7 @@
 
 J and b are linear in the joint angles q. Most high forces are blows: the force follows how deep the step would end
 (decisions 168 and 169). Only the part of the action that leads into the skin is taken back, so whoever wants it fast
-keeps that along the skin.
+keeps that along the skin; and never more than the whole action's size, whatever is foretold for postures never seen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ class TouchLimit(nn.Module):
         size = (inward * inward).sum(-1, keepdim=True).clamp(min=1e-12)
         taken = near * (depth - self.touch_depth).clamp(min=0.0) * inward / size
         share = length(taken) / length(action).clamp(min=1e-6)
-        return action - taken, share.clamp(0.0, 1.0)
+        return action - taken / share.clamp(min=1.0), share.clamp(max=1.0)
 
 
 def length(vectors: Tensor) -> Tensor:
