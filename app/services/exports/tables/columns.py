@@ -7,6 +7,7 @@ from app.services.exports.export_formats import Column, ColumnKind
 
 T, I, N = ColumnKind.TEXT, ColumnKind.INTEGER, ColumnKind.NUMBER  # noqa: E741
 B, W, J = ColumnKind.BOOLEAN, ColumnKind.TIME, ColumnKind.JSON
+"""A letter each (W: when), so that a column is one line to read: there are nearly two hundred."""
 
 PARTICIPANT = Column("participant", T, "Code of the participant.", allowed="P01, P02, ...")
 ORDINAL = Column("ordinal", I, "Place of the pair in this participant's order.", allowed="from 1")

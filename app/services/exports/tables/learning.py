@@ -38,7 +38,7 @@ def _models(session: Session, study: Study, window: Window) -> KeyedRows:
 
 
 def _while_training(model: Model) -> dict[str, Any]:
-    """Methods are measured after they have been kept: that is in evaluations(), for here no row changes."""
+    """Methods are measured after they have been kept: that is in _evaluations(), for here no row changes."""
     if model.kind != ModelKind.METHOD:
         return model.metrics
     return {name: value for name, value in model.metrics.items() if name not in ("evaluation", "seconds")}
