@@ -25,6 +25,7 @@ def add(commands: Commands) -> None:
     add_task(explore)
     explore.add_argument("--work-directory", type=Path, help="finished blocks; default: explore/ in the data directory")
     explore.add_argument("--scenarios", type=int, default=fit_response_surface.SCENARIOS, help="each in twelve modes")
+    explore.add_argument("--sought", type=int, help="scenarios of every later round; default: a fifth of the first's")
     add_processes(explore)
     explore.set_defaults(act=_explore)
 
@@ -45,8 +46,8 @@ def _pretrain(said: argparse.Namespace) -> int:
 def _explore(said: argparse.Namespace) -> int:
     work = said.work_directory or Settings().data_dir / "explore" / said.task
     try:
-        record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios)
-    except (LabTaskBroken, NotAPolicy) as error:
+        record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios, said.sought)
+    except (LabTaskBroken, NotAPolicy, ValueError) as error:
         sys.stderr.write(f"Error: {error}\n")
         return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")

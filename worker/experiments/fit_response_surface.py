@@ -38,8 +38,12 @@ from worker.whole_files import written_whole
 SCENARIOS = 300
 """executed in random modes"""
 SOUGHT_SCENARIOS = 60
-"""executed, in every later round, in modes that somebody would want"""
+"""executed, in every later round, in modes that somebody would want; the studio's own tasks have had 500"""
+MOST_SOUGHT = 1000
+"""so many of every round's are set aside"""
 ROUNDS = 3
+PEOPLE = 960
+"""whose modes are sought in a round, at most: a surface errs where nobody's are"""
 MODES_PER_SCENARIO = 12
 BLOCK = 10
 FOLDS = 10
@@ -92,8 +96,16 @@ class Block:
             return np.array_equal(stored["modes"], self.modes.reshape(-1, self.modes.shape[-1]))
 
 
-def explore(task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS) -> dict[str, Any]:
-    """Run what is missing, fit the response surface, write it and its record; returns the record."""
+def explore(
+    task: str, work_directory: Path, processes: int, scenarios: int = SCENARIOS, sought: int | None = None
+) -> dict[str, Any]:
+    """Run what is missing, fit the response surface, write it and its record; returns the record.
+
+    ``sought``: scenarios of every later round; None: in the usual proportion.
+    """
+    sought = sought_scenarios(scenarios) if sought is None else sought
+    if not 0 < sought <= MOST_SOUGHT or sought % BLOCK:
+        raise ValueError(f"A round has {BLOCK}, {2 * BLOCK}, ... {MOST_SOUGHT} scenarios, and not {sought}.")
     work_directory.mkdir(parents=True, exist_ok=True)
     if registry.lab(task) is not None:
         find_ranges(task)
@@ -110,15 +122,14 @@ def explore(task: str, work_directory: Path, processes: int, scenarios: int = SC
     compute = Compute(processes)
     try:
         _run(compute, processes, blocks, "random modes")
-        per_round = sought_scenarios(scenarios)
         for number in range(ROUNDS):
             surface = _joined(blocks).fit(described)
-            sought = sought_blocks(described, surface, number, work_directory, per_round)
-            _run(compute, processes, sought, f"modes that people want, round {number + 1}")
-            blocks += sought
+            wanted = sought_blocks(described, surface, number, work_directory, sought)
+            _run(compute, processes, wanted, f"modes that people want, round {number + 1}")
+            blocks += wanted
     finally:
         compute.close()
-    return _publish(described, scenarios, _joined(blocks))
+    return _publish(described, scenarios, sought, _joined(blocks))
 
 
 def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
@@ -200,12 +211,14 @@ def sought_blocks(
     count = scenarios // BLOCK
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
-    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in range(per_block)])
+    people = min(PEOPLE, count * per_block)
+    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in range(people)])
     width = surface.high - surface.low
     blocks = []
     for index in range(count):
-        first = RESPONSE_SURFACE_SOUGHT.start + 1000 * number + BLOCK * index
-        around = wanted[rng.permutation(per_block)] + JITTER * width * rng.standard_normal(wanted.shape)
+        first = RESPONSE_SURFACE_SOUGHT.start + MOST_SOUGHT * number + BLOCK * index
+        near = wanted[rng.choice(people, per_block, replace=False)]
+        around = near + JITTER * width * rng.standard_normal(near.shape)
         modes = np.clip(around, surface.low, surface.high).reshape(BLOCK, MODES_PER_SCENARIO, -1)
         blocks.append(Block(task.name, first, modes, work_directory / f"sought-{first}.npz"))
     return blocks
@@ -286,13 +299,13 @@ def share(task: Task, found: Differences, predicted: FloatArray) -> dict[str, fl
     }
 
 
-def _publish(task: Task, scenarios: int, found: Differences) -> dict[str, Any]:
+def _publish(task: Task, scenarios: int, sought: int, found: Differences) -> dict[str, Any]:
     surface, successes = found.fit(task), found.successes
     surface.save(simulation.surface_file(task.name))
     record = {
-        "command": f"python -m worker explore --task {task.name} --scenarios {scenarios}",
+        "command": f"python -m worker explore --task {task.name} --scenarios {scenarios} --sought {sought}",
         "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
-        "sought": {"rounds": ROUNDS, "scenarios_per_round": sought_scenarios(scenarios), "jitter": JITTER},
+        "sought": {"rounds": ROUNDS, "scenarios_per_round": sought, "jitter": JITTER},
         "modes_per_scenario": MODES_PER_SCENARIO,
         "axes": {axis.name: [axis.low, axis.high] for axis in task.modes.axes},
         "reference_success": float(found.reference_success.mean()),

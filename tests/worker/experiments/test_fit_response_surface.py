@@ -44,6 +44,13 @@ def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path)
     assert fit_response_surface.block_episodes(fit_response_surface.SCENARIOS) == random + rounds
 
 
+@pytest.mark.parametrize("sought", [0, 15, fit_response_surface.MOST_SOUGHT + BLOCK])
+def test_scenarios_of_a_round_come_in_blocks_and_rounds_share_none(sought: int, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="A round has 10, 20"):
+        fit_response_surface.explore("feeding", tmp_path, 1, sought=sought)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> None:
     modes = FEEDING.modes.sample(BLOCK * MODES_PER_SCENARIO, np.random.default_rng(0)).reshape(BLOCK, -1, 5)
     block = Block("feeding", 1, modes, tmp_path / "block.npz")
