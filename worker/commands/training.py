@@ -47,7 +47,7 @@ def _explore(said: argparse.Namespace) -> int:
     work = said.work_directory or Settings().data_dir / "explore" / said.task
     try:
         record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios, said.sought)
-    except (LabTaskBroken, NotAPolicy, ValueError) as error:
+    except (LabTaskBroken, NotAPolicy, fit_response_surface.NoRound) as error:
         sys.stderr.write(f"Error: {error}\n")
         return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")

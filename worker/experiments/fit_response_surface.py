@@ -43,7 +43,7 @@ from worker.whole_files import written_whole
 SCENARIOS = 300
 """executed in random modes"""
 SOUGHT_SCENARIOS = 60
-"""executed, in every later round, in modes that somebody would want; the studio's own tasks have had 500"""
+"""executed, in every later round, in modes that somebody would want; Itch Scratching has had 500"""
 MOST_SOUGHT = 1000
 """so many of every round's are set aside"""
 ROUNDS = 3
@@ -58,6 +58,10 @@ LITTLE = 0.2
 FEW_SCENARIOS = 50
 JITTER = 0.08
 """Standard deviation around a mode that somebody wants, as a share of every axis' range."""
+
+
+class NoRound(ValueError):
+    """So many scenarios make no round."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def explore(
     """
     sought = sought_scenarios(scenarios) if sought is None else sought
     if not 0 < sought <= MOST_SOUGHT or sought % BLOCK:
-        raise ValueError(f"A round has {BLOCK}, {2 * BLOCK}, ... {MOST_SOUGHT} scenarios, and not {sought}.")
+        raise NoRound(f"A round has {BLOCK}, {2 * BLOCK}, ... {MOST_SOUGHT} scenarios, and not {sought}.")
     work_directory.mkdir(parents=True, exist_ok=True)
     if registry.lab(task) is not None:
         find_ranges(task)
@@ -227,7 +231,8 @@ def sought_blocks(
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
     people = min(PEOPLE, count * per_block)
-    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in range(people)])
+    asked = tqdm(range(people), unit="person", desc=f"what people would want, round {number + 1}")
+    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in asked])
     width = surface.high - surface.low
     blocks = []
     for index in range(count):

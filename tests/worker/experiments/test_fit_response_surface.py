@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worker.__main__ import main
 from worker.compute import simulation
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
@@ -50,9 +51,14 @@ def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path)
 
 @pytest.mark.parametrize("sought", [0, 15, fit_response_surface.MOST_SOUGHT + BLOCK])
 def test_scenarios_of_a_round_come_in_blocks_and_rounds_share_none(sought: int, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="A round has 10, 20"):
+    with pytest.raises(fit_response_surface.NoRound, match="A round has 10, 20"):
         fit_response_surface.explore("feeding", tmp_path, 1, sought=sought)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_mistyped_number_of_scenarios_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explore", "--task", "feeding", "--work-directory", str(tmp_path), "--sought", "55"]) == 1
+    assert capsys.readouterr().err == "Error: A round has 10, 20, ... 1000 scenarios, and not 55.\n"
 
 
 def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> None:
