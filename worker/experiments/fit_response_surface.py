@@ -43,7 +43,7 @@ from worker.whole_files import written_whole
 SCENARIOS = 300
 """executed in random modes"""
 SOUGHT_SCENARIOS = 60
-"""executed, in every later round, in modes that somebody would want; Itch Scratching has had 500"""
+"""executed, in every later round, in modes that somebody would want"""
 MOST_SOUGHT = 1000
 """so many of every round's are set aside"""
 ROUNDS = 3
