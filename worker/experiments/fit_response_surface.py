@@ -11,11 +11,11 @@ Finished blocks are kept, so an interrupted exploration goes on where it was.
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
@@ -39,6 +39,8 @@ from worker.sim.costs import signal_weights
 from worker.sim.lab.environment import LabEnvironment
 from worker.tasks import registry
 from worker.whole_files import written_whole
+
+R = TypeVar("R")
 
 SCENARIOS = 300
 """executed in random modes"""
@@ -130,11 +132,11 @@ def explore(
     ]
     compute = Compute(processes)
     try:
-        _run(compute, processes, blocks, "random modes")
+        _run(compute, blocks, "random modes")
         for number in range(ROUNDS):
             surface = _joined(blocks).fit(described)
-            wanted = sought_blocks(described, surface, number, work_directory, sought)
-            _run(compute, processes, wanted, f"modes that people want, round {number + 1}")
+            wanted = sought_blocks(compute, described, surface, number, work_directory, sought)
+            _run(compute, wanted, f"modes that people want, round {number + 1}")
             blocks += wanted
     finally:
         compute.close()
@@ -224,15 +226,21 @@ def block_episodes(scenarios: int) -> int:
 
 
 def sought_blocks(
-    task: Task, surface: ResponseSurface, number: int, work_directory: Path, scenarios: int = SOUGHT_SCENARIOS
+    compute: Compute,
+    task: Task,
+    surface: ResponseSurface,
+    number: int,
+    work_directory: Path,
+    scenarios: int = SOUGHT_SCENARIOS,
 ) -> list[Block]:
     """Every scenario is executed in the modes of as many people, and near them."""
     count = scenarios // BLOCK
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
     people = min(PEOPLE, count * per_block)
-    asked = tqdm(range(people), unit="person", desc=f"what people would want, round {number + 1}")
-    wanted = np.array([best_mode(surface, _somebody(task, surface, rng), number) for _ in asked])
+    asked = [(surface, _somebody(task, surface, rng), number) for _ in range(people)]
+    with tqdm(total=people, unit="person", desc=f"what people would want, round {number + 1}") as bar:
+        wanted = np.array(_run_all(compute, best_mode, asked, 16, bar))
     width = surface.high - surface.low
     blocks = []
     for index in range(count):
@@ -257,13 +265,22 @@ def _somebody(task: Task, surface: ResponseSurface, rng: np.random.Generator) ->
     return wants
 
 
-def _run(compute: Compute, processes: int, blocks: Sequence[Block], what: str) -> None:
-    missing = [block for block in blocks if not block.is_there()]
+def _run(compute: Compute, blocks: Sequence[Block], what: str) -> None:
+    missing = [(block,) for block in blocks if not block.is_there()]
     with tqdm(total=len(blocks), initial=len(blocks) - len(missing), unit="block", desc=what) as bar:
-        for first in range(0, len(missing), processes):
-            batch = missing[first : first + processes]
-            compute.run_all(Lane.LEARNING, lambda: None, compare_block, [(block,) for block in batch])
-            bar.update(len(batch))
+        _run_all(compute, compare_block, missing, 1, bar)
+
+
+def _run_all(
+    compute: Compute, function: Callable[..., R], arguments: list[tuple[Any, ...]], each: int, bar: "tqdm[Any]"
+) -> list[R]:
+    """``each``: calls that a process makes before the bar moves."""
+    together, results = each * compute.size(Lane.LEARNING), []
+    for first in range(0, len(arguments), together):
+        batch = arguments[first : first + together]
+        results += compute.run_all(Lane.LEARNING, lambda: None, function, batch)
+        bar.update(len(batch))
+    return results
 
 
 def _joined(blocks: Sequence[Block]) -> Differences:

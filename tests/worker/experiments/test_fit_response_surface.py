@@ -7,6 +7,7 @@ import pytest
 
 from worker.__main__ import main
 from worker.compute import simulation
+from worker.compute.pools import Compute
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
 from worker.ml.filters.exported.filter_act import act_of
@@ -20,8 +21,11 @@ FEEDING = registry.task("feeding")
 
 
 def sought(number: int, work: Path) -> list[Block]:
-    surface = ResponseSurface.load(simulation.surface_file("feeding"), FEEDING.modes)
-    return fit_response_surface.sought_blocks(FEEDING, surface, number, work)
+    surface, compute = ResponseSurface.load(simulation.surface_file("feeding"), FEEDING.modes), Compute(2)
+    try:
+        return fit_response_surface.sought_blocks(compute, FEEDING, surface, number, work)
+    finally:
+        compute.close()
 
 
 @pytest.mark.long
