@@ -115,8 +115,9 @@ def explore(
     ``sought``: scenarios of every later round; None: in the usual proportion.
     """
     sought = sought_scenarios(scenarios) if sought is None else sought
-    if not 0 < sought <= MOST_SOUGHT or sought % BLOCK:
-        raise NoRound(f"A round has {BLOCK}, {2 * BLOCK}, ... {MOST_SOUGHT} scenarios, and not {sought}.")
+    for count, most in ((scenarios, len(RESPONSE_SURFACE)), (sought, MOST_SOUGHT)):
+        if not 0 < count <= most or count % BLOCK:
+            raise NoRound(f"A round has {BLOCK}, {2 * BLOCK}, ... {most} scenarios, and not {count}.")
     work_directory.mkdir(parents=True, exist_ok=True)
     if registry.lab(task) is not None:
         find_ranges(task)

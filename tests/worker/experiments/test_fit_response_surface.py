@@ -8,6 +8,7 @@ import pytest
 from worker.__main__ import main
 from worker.compute import simulation
 from worker.compute.pools import Compute
+from worker.domain.scenarios import RESPONSE_SURFACE
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
 from worker.ml.filters.exported.filter_act import act_of
@@ -53,10 +54,11 @@ def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path)
     assert fit_response_surface.block_episodes(fit_response_surface.SCENARIOS) == random + rounds
 
 
-@pytest.mark.parametrize("sought", [0, 15, fit_response_surface.MOST_SOUGHT + BLOCK])
-def test_scenarios_of_a_round_come_in_blocks_and_rounds_share_none(sought: int, tmp_path: Path) -> None:
-    with pytest.raises(fit_response_surface.NoRound, match="A round has 10, 20"):
-        fit_response_surface.explore("feeding", tmp_path, 1, sought=sought)
+@pytest.mark.parametrize("count", [-10, 0, 15, len(RESPONSE_SURFACE) + BLOCK])
+@pytest.mark.parametrize("of", ["scenarios", "sought"])
+def test_scenarios_of_a_round_come_in_blocks_and_rounds_share_none(of: str, count: int, tmp_path: Path) -> None:
+    with pytest.raises(fit_response_surface.NoRound, match=f"A round has 10, 20, .* and not {count}"):
+        fit_response_surface.explore("feeding", tmp_path, 1, **{of: count})
     assert not list(tmp_path.iterdir())
 
 

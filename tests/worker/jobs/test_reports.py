@@ -70,10 +70,11 @@ def make_report(context: WorkerContext, study: Study) -> Report:
 
 def age(context: WorkerContext, by: timedelta, took: timedelta = timedelta(0)) -> None:
     with context.database.writing() as session:
+        moment = now()
         for report in session.scalars(select(Report)):
-            report.created_at = now() - by
+            report.created_at = moment - by
             run = session.get_one(Run, report.run_id)
-            run.started_at, run.finished_at = now() - took, now()
+            run.started_at, run.finished_at = moment - took, moment
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -149,7 +150,7 @@ def test_on_a_busy_machine_reports_do_not_keep_people_s_models_waiting(context: 
         session.get_one(Study, finished.id).unblinded_at = now() - timedelta(days=1)
         factories.make_rated_trials(session, session.scalars(select(Participant)).first(), 1)  # type: ignore[arg-type]
     slow, very_slow = timedelta(seconds=9), timedelta(minutes=9)
-    age(context, report_files.REST * slow - timedelta(seconds=1), slow)
+    age(context, report_files.AT_MOST_EVERY, slow)
     assert due(context, finished) == []
     age(context, report_files.REST * slow, slow)
     assert len(due(context, finished)) == 1
