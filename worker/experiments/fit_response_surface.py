@@ -1,9 +1,9 @@
 """Explores once, for everybody, what a task's execution modes change: ``python -m worker explore --task NAME``.
 
-Every scenario is executed by the reference policy and in several modes, behind the limit of touches; the differences
-are fitted by a response surface, which ships with the studio. First the modes are drawn at random; then, for some
-rounds, they are the ones that people drawn from a population would be given by the surface so far. What is best for
-somebody lies at the edges of the space of modes, where random modes are rare and a regression promises most.
+Every scenario is executed by the reference policy and in several modes; the differences are fitted by a response
+surface, which ships with the studio. First the modes are drawn at random; then, for some rounds, they are the ones that
+people drawn from a population would be given by the surface so far. What is best for somebody lies at the edges of the
+space of modes, where random modes are rare and a regression promises most.
 
 Finished blocks are kept, so an interrupted exploration goes on where it was.
 """
@@ -13,7 +13,6 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,11 +26,7 @@ from worker.domain.scenarios import RESPONSE_SURFACE, RESPONSE_SURFACE_SOUGHT, f
 from worker.domain.task import Task
 from worker.domain.type_aliases import FloatArray
 from worker.experiments import lab_ranges
-from worker.ml.filters.exported.filter_act import act_of
-from worker.ml.filters.exported.filter_module import FilterWeights
-from worker.ml.filters.exported.shield import untried
 from worker.ml.filters.fitting import response_surface
-from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.teachers import random_taste
@@ -128,7 +123,7 @@ def explore(
         work_directory.mkdir(exist_ok=True)
     described = registry.task(task)
     blocks = [
-        Block(task, first, _random_modes(described, first), work_directory / f"random-{first}.npz")
+        Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
         for first in first_of(RESPONSE_SURFACE, scenarios)[::BLOCK]
     ]
     compute = Compute(processes)
@@ -181,15 +176,13 @@ def _is_known(task: str, described: LabDescription, environment: LabEnvironment)
 
 def compare_block(block: Block) -> None:
     """Differences of one block of scenarios, written to a file that is either complete or absent."""
-    task, policy = registry.task(block.task), simulation.reference_policy(block.task)
-    without_mode = _before_its_first_trial(block.task)
+    policy = simulation.reference_policy(block.task)
     signals, success, reference_success = [], [], []
     for scenario, modes in zip(range(block.first, block.first + BLOCK), block.modes, strict=True):
         reference = simulation.run_episode(block.task, policy.mean, scenario)
         reference_success.append(reference.success)
         for mode in modes:
-            act = act_of(task.modes, policy, without_mode.changed(mode=task.modes.named(mode)))
-            changed = simulation.run_episode(block.task, act, scenario)
+            changed = simulation.run_episode(block.task, simulation.act_in_mode(block.task, mode), scenario)
             signals.append(
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
@@ -197,14 +190,6 @@ def compare_block(block: Block) -> None:
     flat = block.modes.reshape(-1, block.modes.shape[-1])
     with written_whole(block.file) as draft:
         np.savez(draft, modes=flat, signals=signals, success=success, reference_success=reference_success)
-
-
-@cache
-def _before_its_first_trial(name: str) -> FilterWeights:
-    """What every mode is tried in when somebody's is sought: behind the limit of touches."""
-    task, policy = registry.task(name), simulation.reference_policy(name)
-    reference = [simulation.run_episode(name, policy.mean, each) for each in FilterConfig().gate_block(task)]
-    return FilterWeights(shield=untried(task.observation, policy.action_size, reference))
 
 
 def _random_modes(task: Task, first: int) -> FloatArray:
@@ -249,7 +234,7 @@ def sought_blocks(
         near = wanted[rng.choice(people, per_block, replace=False)]
         around = near + JITTER * width * rng.standard_normal(near.shape)
         modes = np.clip(around, surface.low, surface.high).reshape(BLOCK, MODES_PER_SCENARIO, -1)
-        blocks.append(Block(task.name, first, modes, work_directory / f"wanted-{first}.npz"))
+        blocks.append(Block(task.name, first, modes, work_directory / f"sought-{first}.npz"))
     return blocks
 
 

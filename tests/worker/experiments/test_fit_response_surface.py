@@ -11,10 +11,6 @@ from worker.compute.pools import Compute
 from worker.domain.scenarios import RESPONSE_SURFACE
 from worker.experiments import fit_response_surface
 from worker.experiments.fit_response_surface import BLOCK, MODES_PER_SCENARIO, Block, Differences
-from worker.ml.filters.exported.filter_act import act_of
-from worker.ml.filters.exported.filter_module import FilterWeights
-from worker.ml.filters.exported.shield import untried
-from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.tasks import registry
 
@@ -74,24 +70,6 @@ def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> Non
     np.savez(block.file, modes=modes.reshape(-1, 5))
     assert block.is_there()
     assert not Block("feeding", 1, modes + 0.1, block.file).is_there()
-
-
-def test_modes_are_explored_as_they_are_tried_behind_the_limit_of_touches(tmp_path: Path) -> None:
-    task, policy, first = registry.task("scratching"), simulation.reference_policy("scratching"), 100_000
-    quick = task.modes.vector({"stroke_speed": 0.4})
-    fit_response_surface.compare_block(Block(task.name, first, np.tile(quick, (BLOCK, 1, 1)), tmp_path / "block.npz"))
-    with np.load(tmp_path / "block.npz") as stored:
-        explored = stored["signals"]
-    reference = [simulation.run_episode(task.name, policy.mean, each) for each in FilterConfig().gate_block(task)]
-    limit = untried(task.observation, policy.action_size, reference)
-    tried = act_of(task.modes, policy, FilterWeights(mode=task.modes.named(quick), shield=limit))
-    scenarios = range(first, first + BLOCK)
-    before, behind, bare = (
-        np.array([simulation.run_episode(task.name, act, each).signals.sum(axis=0, dtype=float) for each in scenarios])
-        for act in (policy.mean, tried, simulation.act_in_mode(task.name, quick))
-    )
-    np.testing.assert_array_equal(explored, behind - before)
-    assert np.abs(bare - behind).max() > 0.0, "somewhere a stroke must be held back"
 
 
 def test_what_is_foreseen_is_measured_in_scenarios_that_the_surface_has_not_seen() -> None:
