@@ -260,7 +260,7 @@ def _run(compute: Compute, blocks: Sequence[Block], what: str) -> None:
 def _run_all(
     compute: Compute, function: Callable[..., R], arguments: list[tuple[Any, ...]], each: int, bar: "tqdm[Any]"
 ) -> list[R]:
-    """``each``: calls that a process makes before the bar moves."""
+    """Results in the order of the arguments; ``each``: calls that a process makes before the bar moves."""
     together, results = each * compute.size(Lane.LEARNING), []
     for first in range(0, len(arguments), together):
         batch = arguments[first : first + together]
