@@ -24,7 +24,7 @@ from tests.worker.jobs.test_evaluation_films import LABELS, answers_wanted, done
 from worker.compute import baseline_fitting
 from worker.jobs.clips import evaluation_films
 from worker.jobs.clips.evaluation_films import make_films
-from worker.jobs.learning import filters, lent_filters, shared_filters
+from worker.jobs.learning import fits, lent_filters, shared_filters
 from worker.jobs.learning.baselines import train_method
 from worker.jobs.learning.lent_filters import LoanEnded
 from worker.jobs.runtime import due_lending, records
@@ -305,7 +305,7 @@ def test_while_nobody_has_finished_a_filter_is_fitted_to_types_of_users(
     context: WorkerContext, study: Study, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     small = FilterConfig(mode_attempts=1, gate_scenarios=6, residual_rounds=0, evaluation_scenarios=10)
-    monkeypatch.setattr(filters, "filter_config", lambda _settings: small)
+    monkeypatch.setattr(fits, "filter_config", lambda _settings: small)
     settle(context.database, study, trials=1, methods=("pbarl", method))
     learn(context)
     (fitting,) = due(context.database, RunKind.SHARED)

@@ -184,6 +184,17 @@ def test_of_the_modes_that_keep_the_task_the_best_is_taken(
     assert found.trials[-1].preference == max(kept) > 0.0
 
 
+def test_a_mode_may_give_more_of_what_is_liked_than_any_clip_has_shown(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    asked = problem(1.0, reference)
+    assert isinstance(asked.reward, StructuredReward)
+    shown = replace(asked.reward, most_per_step=np.mean([each.signals.mean(axis=0) for each in reference], axis=0))
+    found = mode_search.find_mode(replace(asked, reward=shown), surface, [], reference, World().collect)
+    assert found.trials[-1].preference > 0.0
+    assert found.weights.mode["speed_far"] > 0.2
+
+
 def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[Trajectory]) -> None:
     """An adapter trained for somebody who wants the opposite."""
     wrong = learn_round(

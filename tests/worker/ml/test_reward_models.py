@@ -302,6 +302,23 @@ def test_nobody_is_rewarded_for_less_of_a_signal_than_was_ever_shown_and_may_mak
         assert each == pytest.approx(np.full(8, -1.0)), "a robot that does nothing is not better than the calmest shown"
 
 
+def test_what_was_driven_is_judged_beyond_what_was_shown_if_the_task_got_done() -> None:
+    weights = np.zeros((8, len(SIGNALS)))
+    weights[:, SIGNALS.index("speed_m_s")] = 0.5
+    undone = SIGNALS.index("undelivered")
+    model = StructuredReward(weights, most_per_step=np.full(len(SIGNALS), 0.1), undone_column=undone)
+    rng = np.random.default_rng(0)
+    shown, faster, failing = (
+        invented.trajectory(rng, steps=15, signals=np.zeros((15, len(SIGNALS)), np.float32)) for _ in range(3)
+    )
+    for driven, speed in ((shown, 0.1), (faster, 40.0), (failing, 40.0)):
+        driven.signals[:, SIGNALS.index("speed_m_s")] = speed
+    failing.signals[:, undone] = 1.0
+    assert model.returns([shown]) == pytest.approx(model.returns([faster])), "whatever is trained has no use for more"
+    worth = model.member_returns([shown, faster, failing])
+    np.testing.assert_allclose(worth, np.tile([15 * 0.05, 15 * 20.0, 0.0], (8, 1)), rtol=1e-6)
+
+
 def test_whole_episodes_count_as_shown_beside_the_clips(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
     clips = SignalScale.of(labelled[0])
     longer = SignalScale.of(labelled[0], [clips.least_per_step - 1.0, clips.most_per_step - 0.5])

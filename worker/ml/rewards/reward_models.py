@@ -80,8 +80,11 @@ class RewardModel(ABC):
 
     def normalised(self, raw_rewards: FloatArray) -> FloatArray:
         """In units of the reference policy's steps, and clipped. Any shape."""
+        return np.clip(self._scaled(raw_rewards), -CLIP, CLIP)
+
+    def _scaled(self, raw_rewards: FloatArray) -> FloatArray:
         rewards: FloatArray = (raw_rewards - self.normalisation.offset) / self.normalisation.scale
-        return np.clip(rewards, -CLIP, CLIP)
+        return rewards
 
     def episode_rewards(self, signals: Float32Array, observations: Float32Array, actions: Float32Array) -> FloatArray:
         """Normalised and clipped rewards of one whole episode. (T, S), (T, D), (T, 7) -> (E, T)
@@ -89,7 +92,9 @@ class RewardModel(ABC):
         No step of an episode that ends with the task undone is worth more than a usual step of the reference policy:
         clips end before tasks do, so labels hardly say how much more anybody minds not being served at all.
         """
-        rewards = self._earned(signals, observations, actions)
+        return self._if_done(self._earned(signals, observations, actions), signals)
+
+    def _if_done(self, rewards: FloatArray, signals: Float32Array) -> FloatArray:
         undone = self.undone_column is not None and signals[-1, self.undone_column] > 0.0
         return np.minimum(rewards, 0.0) if undone else rewards
 
@@ -102,11 +107,16 @@ class RewardModel(ABC):
         return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
 
     def member_returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
-        """Summed normalised rewards of each trajectory under every member, (E, N)."""
-        of_steps = (
-            self.episode_rewards(each.signals, each.observations[: len(each)], each.actions) for each in trajectories
+        """What each trajectory is worth to every member, (E, N): as episode_rewards(), but not clipped nor limited.
+
+        Clipping and limits keep whatever is trained on a reward from what nobody has seen. What was trained is judged
+        without them: else nothing is better for a person than the most of what they like that a clip ever showed.
+        """
+        raw = (self.raw_rewards(each.signals, each.observations[: len(each)], each.actions) for each in trajectories)
+        pairs = zip(raw, trajectories, strict=True)
+        return np.stack(
+            [self._if_done(self._scaled(each), driven.signals).sum(axis=-1) for each, driven in pairs], axis=1
         )
-        return np.stack([rewards.sum(axis=-1) for rewards in of_steps], axis=1)
 
     def rewards_of(self, trajectory: Trajectory) -> FloatArray:
         """Mean over members of the normalised reward of every step, (T,)."""
