@@ -156,9 +156,9 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "replayed_waiting": REAL_TIME,
     "retraining": ROLLOUTS,
     "promises": ROLLOUTS,
-    "promise_error_rates": "--people 2",
-    "rivals": "--report-only",
-    "rivals_error_rates": "--tables 1",
+    "promise_error_rates": "--people 2 --output promise_error_rates",
+    "rivals": "--report-only --output results/rivals",
+    "rivals_error_rates": "--tables 1 --output rivals_error_rates",
     "rooms": Elsewhere("tests/architecture/test_rooms.py::test_the_picture_of_the_rooms_is_up_to_date"),
     "rounds": "1",
     "same_bits": OnlyParsed("trains every method; docs/results/same_bits.txt is what it prints"),
@@ -277,9 +277,10 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         database.dispose()
     results = directory / "results"
     results.mkdir()
-    for file in (ROOT / "docs/results").glob("feedback_efficiency-*.csv"):
+    tables = ROOT / "docs/results"
+    for file in (*tables.glob("feedback_efficiency-*.csv"), tables / "rivals.csv"):
         shutil.copy(file, results)
-    shutil.copytree(ROOT / "docs/results/paper_form", results / "paper_form")
+    shutil.copytree(tables / "paper_form", results / "paper_form")
     return directory
 
 

@@ -21,6 +21,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
+from tests.benchmarks import tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Promise, harms, outcome_of
 from worker.compute import simulation
@@ -84,7 +85,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Mapping[str, Any]] = list(csv.DictReader(table.open())) if table.exists() else []
+    rows: list[Mapping[str, Any]] = list(tables.read(table))
     known = {(row["task"], row["user"], row["change"]) for row in rows if row["method"] == default_method(row["task"])}
     people = [(task, user) for user in PAPER_USERS for task in options.tasks]
     for task, user in tqdm(people, unit="filter"):

@@ -22,6 +22,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
+from tests.benchmarks import tables
 from worker.analysis.comparison import result_pages
 from worker.compute import learning
 from worker.domain.scenarios import EVALUATION, first_of
@@ -50,7 +51,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Mapping[str, Any]] = list(csv.DictReader(table.open())) if table.exists() else []
+    rows: list[Mapping[str, Any]] = list(tables.read(table))
     known = {(row["learner"], int(row["seed"])) for row in rows}
     work = options.work_directory
     cell = Cell(TASK, PAPER_USERS[USER], "residual_rl", 0)

@@ -21,7 +21,7 @@ import torch
 from tqdm import tqdm
 
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
-from tests.benchmarks import answered_pool
+from tests.benchmarks import answered_pool, tables
 from tests.benchmarks.answered_pool import AnsweredPool
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type, of_taste
 from worker.analysis.comparison import result_pages
@@ -46,7 +46,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Row] = list(csv.DictReader(table.open())) if table.exists() else []
+    rows: list[Row] = list(tables.read(table))
     done = {(row["task"], row["person"], row["mistakes"], row["seed"]) for row in rows}
     pools: dict[str, AnsweredPool] = {}
     planned = [

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from app.installed_tasks.by_name import usual_refinement_steps
+from tests.benchmarks import tables
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import HARMS, Promise, harms, outcome_of
@@ -56,7 +57,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Row] = list(csv.DictReader(table.open())) if table.exists() else []
+    rows: list[Row] = list(tables.read(table))
     for number in tqdm(range(options.people), unit="person"):
         for task in options.tasks:
             done = [row for row in rows if (row["task"], int(row["person"])) == (task, number)]

@@ -23,7 +23,7 @@ import torch
 from tqdm import tqdm
 
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
-from tests.benchmarks import doubt
+from tests.benchmarks import doubt, tables
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.doubt import ANSWERS
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
@@ -142,8 +142,7 @@ def _name_of(row: Row) -> tuple[int, str, str, str]:
 
 
 def _rows(table: Path, task: str = "") -> list[Row]:
-    found = list(csv.DictReader(table.open())) if table.exists() else []
-    return [row for row in found if not task or row["task"] == task]
+    return [row for row in tables.read(table) if not task or row["task"] == task]
 
 
 def _append(table: Path, more: Sequence[Row]) -> None:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from app.settings import Settings
-from tests.benchmarks import rivals_report
+from tests.benchmarks import rivals_report, tables
 from worker.analysis.comparison import result_pages
 from worker.commands import options as spoken
 from worker.domain.type_aliases import FloatArray
@@ -66,7 +66,7 @@ def main() -> None:
     """Run what has no row yet, cell by cell."""
     options = _options()
     table = options.output.with_suffix(".csv")
-    rows = rivals_report.read(table)
+    rows: list[rivals_report.Row] = list(tables.read(table))
     known = {rivals_report.name_of(row) for row in rows}
     missing = [cell for cell in _cells(options) if (cell.task, cell.taste.name, cell.method, cell.seed) not in known]
     if not options.report_only:

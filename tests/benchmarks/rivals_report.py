@@ -1,8 +1,6 @@
 """The page of tests.benchmarks.rivals from its table alone: every number on it follows from the rows."""
 
-import csv
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,12 +28,6 @@ _FINE = 1000.0
 
 Row = Mapping[str, Any]
 Name = tuple[str, str, str, int]
-
-
-def read(table: Path) -> list[Row]:
-    """The rows of a table; none when there is no file."""
-    csv.field_size_limit(1_000_000)
-    return list(csv.DictReader(table.open())) if table.exists() else []
 
 
 def name_of(row: Row) -> Name:

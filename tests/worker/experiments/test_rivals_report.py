@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.benchmarks import rivals_report
+from tests.benchmarks import rivals_report, tables
 from worker.domain.type_aliases import FloatArray
 
 
@@ -53,7 +53,7 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
 
 
 def test_no_table_is_no_rows(tmp_path: Any) -> None:
-    assert rivals_report.read(tmp_path / "missing.csv") == []
+    assert tables.read(tmp_path / "missing.csv") == []
 
 
 @pytest.mark.parametrize("method", ["pbarl", "dsrl"])
