@@ -22,7 +22,8 @@ class GateTrial:
     gate: float
     residual_share: float
     preference: float
-    """mean change of the learned return, in standard deviations of the reference's returns"""
+    """mean change of the learned return, not limited (RewardModel.member_returns), in standard deviations of the
+    reference's returns"""
     success_change: float
     """share of episodes"""
     p95_force_n: float
