@@ -18,6 +18,7 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.gate import try_on
 from worker.ml.filters.fitting.residual import learn_round
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import StructuredReward
@@ -184,15 +185,20 @@ def test_of_the_modes_that_keep_the_task_the_best_is_taken(
     assert found.trials[-1].preference == max(kept) > 0.0
 
 
-def test_a_mode_may_give_more_of_what_is_liked_than_any_clip_has_shown(
-    reference: list[Trajectory], surface: ResponseSurface
+def test_the_gate_sees_that_more_of_what_is_liked_is_better_though_no_clip_has_shown_so_much(
+    reference: list[Trajectory],
 ) -> None:
     asked = problem(1.0, reference)
     assert isinstance(asked.reward, StructuredReward)
-    shown = replace(asked.reward, most_per_step=np.mean([each.signals.mean(axis=0) for each in reference], axis=0))
-    found = mode_search.find_mode(replace(asked, reward=shown), surface, [], reference, World().collect)
-    assert found.trials[-1].preference > 0.0
-    assert found.weights.mode["speed_far"] > 0.2
+    most = np.max([each.signals.mean(axis=0) for each in reference], axis=0)
+    shown = replace(asked, reward=replace(asked.reward, most_per_step=most))
+    quick, quicker = (
+        try_on(
+            shown, act_of(FAMILY, POLICY, FilterWeights(mode={"speed_far": fast})), 1.0, 0.0, reference, World().collect
+        )[0].preference
+        for fast in (0.25, 0.45)
+    )
+    assert quicker > 1.3 * quick > 0.0
 
 
 def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[Trajectory]) -> None:
