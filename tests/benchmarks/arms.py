@@ -6,7 +6,6 @@ Writes docs/results/arms.csv and .md. Every arm is chosen by the function that t
 """
 
 import argparse
-import csv
 import heapq
 from collections import Counter
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.study_settings import StudySettings
 from app.services.participants.arms import SILENT_AFTER, Load, choose, is_open
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 
 RESULTS = Path("docs/results")
@@ -120,10 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             rows += [row(arms, each, dropout, typed.arrivals, typed.studies, 0) for each in AT_ONCE]
             rows += [row(arms, each, dropout, typed.arrivals, typed.studies, QUOTA) for each in AT_ONCE[1:]]
     typed.to.mkdir(parents=True, exist_ok=True)
-    with (typed.to / "arms.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(typed.to / "arms.csv", rows)
     shown = [name for name in rows[0] if name not in ("arrivals", "studies")]
     lines = ["| " + " | ".join(name.replace("_percent", ", %").replace("_", " ") for name in shown) + " |"]
     lines += [

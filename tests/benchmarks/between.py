@@ -6,7 +6,6 @@ Writes docs/results/between.csv, order_effects.csv and between.md, by the functi
 """
 
 import argparse
-import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from scipy import optimize, stats
 from tqdm import tqdm
 
 from app.services.evaluation.evaluation_plan import williams_rows
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.between import equivalence_between, means_of, permutation, welch_t
 from worker.analysis.study.cumulative_link import fit_two, tested_between
@@ -173,10 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         order_row(people, drift, max(options.studies // 2, 1)) for drift in (0.0, 0.3) for people in (6, 8, 16, 24)
     ]
     for name, rows in (("between", between), ("order_effects", order)):
-        with (options.to / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        result_tables.write(options.to / f"{name}.csv", rows)
     page = options.to / "between.md"
     page.write_text(result_pages.page(page, TITLE, f"{_table(between)}\n\n{_table(order)}"))
 

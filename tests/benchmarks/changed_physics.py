@@ -8,7 +8,6 @@ one core at the lowest priority; every finished row is kept, so that it can be i
 """
 
 import argparse
-import csv
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from tests.benchmarks import tables
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Promise, harms, outcome_of
 from worker.compute import simulation
@@ -41,7 +40,6 @@ from worker.sim.engine import pybullet
 from worker.sim.human import Impairment
 from worker.sim.rollout import rollout
 from worker.tasks import registry
-from worker.whole_files import written_whole
 
 TITLE = "# Filters under changed physics"
 SKIP = 500_000
@@ -85,7 +83,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Mapping[str, Any]] = list(tables.read(table))
+    rows: list[Mapping[str, Any]] = list(result_tables.read(table))
     known = {(row["task"], row["user"], row["change"]) for row in rows if row["method"] == default_method(row["task"])}
     people = [(task, user) for user in PAPER_USERS for task in options.tasks]
     for task, user in tqdm(people, unit="filter"):
@@ -220,10 +218,7 @@ def _shield_active(act: FilterAct, filtered: Sequence[Trajectory]) -> float:
 def _write(rows: Sequence[Mapping[str, Any]], output: Path) -> None:
     if not rows:
         return
-    with written_whole(output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(output.with_suffix(".csv"), rows)
     page = output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, _tables(rows)))
 

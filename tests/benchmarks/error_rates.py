@@ -6,7 +6,6 @@ Writes docs/results/error_rates.csv and .md. Everything is computed by the funct
 """
 
 import argparse
-import csv
 import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from tests.benchmarks import error_rates_of_intervals
+from tests.benchmarks import error_rates_of_intervals, result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.effect_sizes import holm
 from worker.analysis.study.hypothesis_tests import mixed_model, paired_t, two_sample_t, wilcoxon
@@ -159,17 +158,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     rows = [row for truth in tqdm(TRUTHS, file=sys.stderr) for row in rates(truth, options.studies)]
     intervals = error_rates_of_intervals.rows(options.studies)
-    _write(options.to / "error_rates.csv", rows)
-    _write(options.to / "error_rates_of_intervals.csv", intervals)
+    result_tables.write(options.to / "error_rates.csv", rows)
+    result_tables.write(options.to / "error_rates_of_intervals.csv", intervals)
     page = options.to / "error_rates.md"
     page.write_text(result_pages.page(page, TITLE, tables(rows, intervals)))
-
-
-def _write(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with file.open("w", newline="") as target:
-        writer = csv.DictWriter(target, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 TITLE = "# Error rates of the tests and intervals that the studio shows"

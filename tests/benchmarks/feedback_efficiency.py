@@ -13,7 +13,6 @@ has 1020 pairs.
 """
 
 import argparse
-import csv
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -27,7 +26,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from tests.benchmarks import feedback_report
+from tests.benchmarks import feedback_report, result_tables
 from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.feedback_report import LINEAR, NAMED, Row
 from tests.benchmarks.pool_rollouts import Pool, pool_rollouts
@@ -335,13 +334,8 @@ def _finished(bench: Bench, file: Path) -> dict[Chain, list[Row]]:
 
 
 def _write(file: Path, rows: Sequence[Row]) -> None:
-    """Replace the file at once, so that an interruption leaves it whole."""
-    unfinished = file.with_suffix(".unfinished")
-    with unfinished.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows)
-    unfinished.replace(file)
+    rounded = [{name: round(v, 4) if isinstance(v, float) else v for name, v in row.items()} for row in rows]
+    result_tables.write(file, rounded)
 
 
 def _options() -> argparse.Namespace:

@@ -6,7 +6,6 @@ Writes docs/results/head_to_head.csv and .md. Everything is computed by the func
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.bradley_terry import comparisons, fits, strengths
 from worker.domain.type_aliases import FloatArray
@@ -114,10 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for spread in spreads
         for people in numbers
     ]
-    with (options.to / "head_to_head.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.to / "head_to_head.csv", rows)
     lines = ["| " + " | ".join(name.replace("_percent", ", %").replace("_", " ") for name in rows[0]) + " |"]
     lines += ["|---" * len(rows[0]) + "|", *("| " + " | ".join(map(str, each.values())) + " |" for each in rows)]
     page = options.to / "head_to_head.md"

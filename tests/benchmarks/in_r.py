@@ -10,7 +10,6 @@ scripts: a test asks for a new run when one of them has changed.
 """
 
 import argparse
-import csv
 import hashlib
 import shutil
 import subprocess
@@ -27,6 +26,7 @@ from scipy import stats
 
 from app.paths import ANALYSIS
 from app.services.exports import export_tables
+from tests.benchmarks import result_tables
 from tests.worker.analysis.test_exported_scripts import (
     Rows,
     Tables,
@@ -242,10 +242,8 @@ def _run(script: Path, *arguments: Path) -> None:
 
 def save(target: Path, scripted: Sequence[Mapping[str, Any]], compared: Sequence[Mapping[str, Any]]) -> None:
     """in_r.csv, every number that was compared by hand; and the tables of in_r.md."""
-    with (target / "in_r.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(compared[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({**row, "r": f"{row['r']:.9g}", "report": f"{row['report']:.9g}"} for row in compared)
+    short = [{**row, "r": f"{row['r']:.9g}", "report": f"{row['report']:.9g}"} for row in compared]
+    result_tables.write(target / "in_r.csv", short)
     page = target / "in_r.md"
     kept = page.read_text().partition(MARK)[0] if page.exists() else ""
     version = subprocess.run(["R", "--version"], capture_output=True, text=True, check=True).stdout.split("\n")[0]

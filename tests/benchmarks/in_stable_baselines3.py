@@ -8,7 +8,6 @@ nothing that Stable-Baselines3 can be told). Each learner and seed is a row; fin
 """
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
-from tests.benchmarks import tables
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.compute import learning
 from worker.domain.scenarios import EVALUATION, first_of
@@ -37,7 +36,6 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.preference_rl import TRAINING_SCENARIOS, EpisodeReward
 from worker.ml.rewards.reward_models import UNDONE, RewardModel
 from worker.tasks import registry
-from worker.whole_files import written_whole
 
 TITLE = "# Our SAC beside Stable-Baselines3's"
 TASK, USER = "feeding", "neutral"
@@ -51,7 +49,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Mapping[str, Any]] = list(tables.read(table))
+    rows: list[Mapping[str, Any]] = list(result_tables.read(table))
     known = {(row["learner"], int(row["seed"])) for row in rows}
     work = options.work_directory
     cell = Cell(TASK, PAPER_USERS[USER], "residual_rl", 0)
@@ -199,10 +197,7 @@ def _measured(act: Act, bench: BenchmarkUser) -> Mapping[str, Any]:
 def _write(rows: Sequence[Mapping[str, Any]], output: Path) -> None:
     if not rows:
         return
-    with written_whole(output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(output.with_suffix(".csv"), rows)
     lines = [
         "| learner | seed | steps | gain per episode | success | of the frozen policy | processor s |",
         "|---" * 7 + "|",

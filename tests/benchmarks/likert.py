@@ -7,7 +7,6 @@ models with a random intercept alone, which are not offered.
 """
 
 import argparse
-import csv
 import sys
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ import numpy as np
 from scipy import optimize, stats
 from tqdm import tqdm
 
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.cumulative_link import Fit, fit_two, tested
 from worker.analysis.study.hypothesis_tests import equivalence, mixed_model, paired_t, two_sample_t, wilcoxon
@@ -163,10 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--to", type=Path, default=RESULTS, help="folder to write to")
     options = parser.parse_args(arguments)
     rows = [row for truth in tqdm(TRUTHS, file=sys.stderr) for row in rates(truth, options.studies)]
-    with (options.to / "likert.csv").open("w", newline="") as target:
-        writer = csv.DictWriter(target, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.to / "likert.csv", rows)
     page = options.to / "likert.md"
     page.write_text(result_pages.page(page, TITLE, tables(rows)))
 

@@ -10,7 +10,6 @@ command to go on, with more --people to add to them.
 """
 
 import argparse
-import csv
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -21,14 +20,13 @@ import torch
 from tqdm import tqdm
 
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
-from tests.benchmarks import answered_pool, tables
+from tests.benchmarks import answered_pool, result_tables
 from tests.benchmarks.answered_pool import AnsweredPool
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type, of_taste
 from worker.analysis.comparison import result_pages
 from worker.analysis.wilson import wilson_interval
 from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.teachers import Manner, User, random_taste
-from worker.whole_files import written_whole
 
 TITLE = "# Whether the studio notices that a model does not fit"
 ANSWERS = 200
@@ -46,7 +44,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Row] = list(tables.read(table))
+    rows: list[Row] = list(result_tables.read(table))
     done = {(row["task"], row["person"], row["mistakes"], row["seed"]) for row in rows}
     pools: dict[str, AnsweredPool] = {}
     planned = [
@@ -98,10 +96,7 @@ def _write(rows: Sequence[Row], options: argparse.Namespace) -> None:
     """Table and page of everybody so far."""
     page = options.output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, _tables(rows)))
-    with written_whole(options.output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.output.with_suffix(".csv"), rows)
 
 
 def _tables(rows: Sequence[Row]) -> str:

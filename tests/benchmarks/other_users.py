@@ -11,7 +11,6 @@ go on.
 """
 
 import argparse
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -25,6 +24,7 @@ import torch
 from tqdm import tqdm
 
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
+from tests.benchmarks import result_tables
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person, as_type
 from worker.analysis.comparison import result_pages
@@ -183,10 +183,7 @@ def _write(planned: Sequence[tuple[int, str, str, str]], options: argparse.Names
     files = {each: _file(options, *each) for each in planned}
     kept = {each: dict(np.load(file)) for each, file in files.items() if file.exists()}
     rows = [_row(each, kept) for each in kept if each[3] == LINEAR]
-    with written_whole(options.output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.output.with_suffix(".csv"), rows)
     page = options.output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, _table(rows)))
 

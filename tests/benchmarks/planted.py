@@ -43,7 +43,7 @@ from app.services.studies import power, studies
 from app.settings import Settings
 from app.storage import ArtefactStore
 from tests import factories
-from tests.benchmarks import planted_report
+from tests.benchmarks import planted_report, result_tables
 from tests.benchmarks.planted_report import found_in
 from tests.conftest import serving
 from tests.databases import make_tables
@@ -357,10 +357,7 @@ def rates(path: Path, invented: int, say: Callable[[str], object]) -> list[dict[
                         }
                     )
     rows.sort(key=lambda row: (list(TRUTHS).index(row["truth"]), MEASURES.index(row["measure"]), row["people"]))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(path, rows)
     return planted_report.read(path)
 
 

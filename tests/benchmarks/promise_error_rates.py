@@ -7,7 +7,6 @@ until the promise is earned. How often a scenario is harmed is known here. Nothi
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome, Promise
 from worker.compute.harm_tests import STRENGTHS, weakened_until_promised
@@ -48,10 +48,7 @@ def main() -> None:
     ]
     page = options.output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, _table(rows, options.people)))
-    with options.output.with_suffix(".csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.output.with_suffix(".csv"), rows)
 
 
 def _row(promise: Promise, words: str, rates: Sequence[float], people: int) -> dict[str, Any]:

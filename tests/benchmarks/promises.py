@@ -9,7 +9,6 @@ the page is written anew. Interrupted, it goes on where it was; other --people a
 """
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from tqdm import tqdm
 from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
 from app.installed_tasks.by_name import usual_refinement_steps
-from tests.benchmarks import tables
+from tests.benchmarks import result_tables
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import HARMS, Promise, harms, outcome_of
@@ -57,7 +56,7 @@ def main() -> None:
     options = _options()
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
-    rows: list[Row] = list(tables.read(table))
+    rows: list[Row] = list(result_tables.read(table))
     for number in tqdm(range(options.people), unit="person"):
         for task in options.tasks:
             done = [row for row in rows if (row["task"], int(row["person"])) == (task, number)]
@@ -182,10 +181,7 @@ def _row(
 def _write(rows: Sequence[Row], options: argparse.Namespace) -> None:
     if not rows:
         return
-    with written_whole(options.output.with_suffix(".csv")) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(options.output.with_suffix(".csv"), rows)
     page = options.output.with_suffix(".md")
     page.write_text(result_pages.page(page, TITLE, _tables(rows)))
 

@@ -10,7 +10,6 @@ lowest priority; what has a row is never run again.
 """
 
 import argparse
-import csv
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,7 +22,7 @@ import torch
 from tqdm import tqdm
 
 from app.services.answers.accuracy import ENOUGH_EVIDENCE
-from tests.benchmarks import doubt, tables
+from tests.benchmarks import doubt, result_tables
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.doubt import ANSWERS
 from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
@@ -43,7 +42,6 @@ from worker.ml.methods.registry import Setting
 from worker.ml.rewards.beyond_sums import misfit
 from worker.ml.teachers import TASTES
 from worker.tasks import registry
-from worker.whole_files import written_whole
 
 TITLE = "# What filters give people who are not linear"
 QUICK, REFINED = "pbarl", "pbarl_refined"
@@ -142,15 +140,12 @@ def _name_of(row: Row) -> tuple[int, str, str, str]:
 
 
 def _rows(table: Path, task: str = "") -> list[Row]:
-    return [row for row in tables.read(table) if not task or row["task"] == task]
+    return [row for row in result_tables.read(table) if not task or row["task"] == task]
 
 
 def _append(table: Path, more: Sequence[Row]) -> None:
     rows = [*_rows(table), *more]
-    with written_whole(table) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(table, rows)
 
 
 def _report(output: Path, counted: Path) -> None:

@@ -6,13 +6,13 @@ Writes docs/results/reliability.csv and .md. Everything is computed by the funct
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.reliability import alpha, reliability_report
 from worker.domain.type_aliases import FloatArray
@@ -96,10 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def write(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     """As CSV, and as the table of the page, whose words stay."""
-    with (folder / "reliability.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    result_tables.write(folder / "reliability.csv", rows)
     heads = (
         "items are",
         "items",

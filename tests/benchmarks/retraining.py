@@ -9,7 +9,6 @@ machine: these are plain seconds.
 """
 
 import argparse
-import csv
 import os
 import sys
 import time
@@ -22,6 +21,7 @@ from tqdm import tqdm
 
 from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome
 from worker.compute import filter_finishing, learning
@@ -53,10 +53,7 @@ def main() -> None:
     if options.output:
         page = options.output.with_suffix(".md")
         page.write_text(result_pages.page(page, TITLE, _tables(rows, options)))
-        with options.output.with_suffix(".csv").open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        result_tables.write(options.output.with_suffix(".csv"), rows)
 
 
 def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[str, Any]]:

@@ -10,7 +10,6 @@ loses the present cell. Seeds are finished one by one, cheap methods first; --ta
 """
 
 import argparse
-import csv
 import json
 import os
 import sys
@@ -23,7 +22,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from app.settings import Settings
-from tests.benchmarks import rivals_report, tables
+from tests.benchmarks import result_tables, rivals_report
 from worker.analysis.comparison import result_pages
 from worker.commands import options as spoken
 from worker.domain.type_aliases import FloatArray
@@ -35,7 +34,6 @@ from worker.ml.methods.registry import METHODS
 from worker.ml.teachers import Taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
-from worker.whole_files import written_whole
 
 CHEAP_FIRST = (
     "pbarl",
@@ -66,7 +64,7 @@ def main() -> None:
     """Run what has no row yet, cell by cell."""
     options = _options()
     table = options.output.with_suffix(".csv")
-    rows: list[rivals_report.Row] = list(tables.read(table))
+    rows: list[rivals_report.Row] = list(result_tables.read(table))
     known = {rivals_report.name_of(row) for row in rows}
     missing = [cell for cell in _cells(options) if (cell.task, cell.taste.name, cell.method, cell.seed) not in known]
     if not options.report_only:
@@ -82,7 +80,7 @@ def main() -> None:
 def _measure(missing: Sequence[Cell], rows: list[rivals_report.Row], options: argparse.Namespace) -> None:
     for cell in tqdm(missing, unit="cell"):
         rows.append(_row(cell, options.work_directory))
-        _write(rows, options.output.with_suffix(".csv"))
+        result_tables.write(options.output.with_suffix(".csv"), rows)
 
 
 def _have_measured(missing: Sequence[Cell], rows: list[rivals_report.Row], options: argparse.Namespace) -> list[Cell]:
@@ -93,7 +91,7 @@ def _have_measured(missing: Sequence[Cell], rows: list[rivals_report.Row], optio
         for cell in [each for each in left if all(_has(part, work) for part in (each, _of(each, "reference")))]:
             left.remove(cell)
             rows.append(_row(cell, work))
-            _write(rows, options.output.with_suffix(".csv"))
+            result_tables.write(options.output.with_suffix(".csv"), rows)
 
     needed = dict.fromkeys(part for each in missing for part in (_of(each, "reference"), each))
     asked = [cell for cell in needed if not _has(cell, work)]
@@ -155,13 +153,6 @@ def _true(arrays: Mapping[str, Any], cell: Cell, measure: Any) -> FloatArray:
         registry.task(cell.task), arrays["costs"], arrays["signals"], taste.omega, TERMS.form, taste.per_signal
     )
     return found
-
-
-def _write(rows: Sequence[Mapping[str, Any]], table: Path) -> None:
-    with written_whole(table) as path, path.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _options() -> argparse.Namespace:

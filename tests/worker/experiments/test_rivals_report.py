@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.benchmarks import rivals_report, tables
+from tests.benchmarks import result_tables, rivals_report
 from worker.domain.type_aliases import FloatArray
 
 
@@ -53,9 +53,17 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
 
 
 def test_no_table_is_no_rows(tmp_path: Any) -> None:
-    assert tables.read(tmp_path / "missing.csv") == []
+    assert result_tables.read(tmp_path / "missing.csv") == []
 
 
 @pytest.mark.parametrize("method", ["pbarl", "dsrl"])
 def test_what_a_fit_needs_is_told(method: str) -> None:
     assert f"| `{method}` | 1 | 200 | 50000 | 60 |" in rivals_report.page([row(method, np.zeros(100), np.ones(100))])
+
+
+def test_a_table_whose_writing_fails_stays_as_it_was(tmp_path: Any) -> None:
+    table = tmp_path / "rows.csv"
+    result_tables.write(table, [{"user": "neutral", "gain": 1.5}])
+    with pytest.raises(ValueError):
+        result_tables.write(table, [{"user": "neutral"}, {"user": "cautious", "gain": 2.5}])
+    assert result_tables.read(table) == [{"user": "neutral", "gain": "1.5"}]
