@@ -201,6 +201,20 @@ def test_the_gate_sees_that_more_of_what_is_liked_is_better_though_no_clip_has_s
     assert quicker > 1.3 * quick > 0.0
 
 
+def test_a_residual_is_learned_for_more_of_what_is_liked_though_no_clip_has_shown_so_much(
+    reference: list[Trajectory],
+) -> None:
+    torch.set_num_threads(1)
+    asked = problem(1.0, reference)
+    assert isinstance(asked.reward, StructuredReward)
+    slowest = 0.05 * np.min([each.signals.mean(axis=0) for each in reference], axis=0)
+    shown = replace(asked, reward=replace(asked.reward, most_per_step=slowest))
+    quick = FilterDraft(FilterWeights(mode={"speed_far": 0.3}))
+    learned, limited = (residual.train_residual(each, quick, World().collect) for each in (asked, shown))
+    assert speed_of(learned) > 1.1 * speed_of(quick)
+    assert limited.weights.to_bytes() == learned.weights.to_bytes(), "by weights, whatever clips have shown"
+
+
 def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[Trajectory]) -> None:
     """An adapter trained for somebody who wants the opposite."""
     wrong = learn_round(

@@ -106,17 +106,19 @@ class RewardModel(ABC):
         """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
         return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
 
-    def member_returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
-        """What each trajectory is worth to every member, (E, N): as episode_rewards(), but not clipped nor limited.
+    def member_rewards(self, trajectory: Trajectory) -> FloatArray:
+        """What each step is worth to every member, (E, T): as episode_rewards(), but not clipped nor limited.
 
-        Clipping and limits keep whatever is trained on a reward from what nobody has seen. What was trained is judged
-        without them: else nothing is better for a person than the most of what they like that a clip ever showed.
+        Clipping and limits keep a policy that may do anything from what nobody has seen. What stays near a mode, and what
+        is judged, goes by these: else nothing is better for a person than the most of what they like that a clip showed.
         """
-        raw = (self.raw_rewards(each.signals, each.observations[: len(each)], each.actions) for each in trajectories)
-        pairs = zip(raw, trajectories, strict=True)
-        return np.stack(
-            [self._if_done(self._scaled(each), driven.signals).sum(axis=-1) for each, driven in pairs], axis=1
-        )
+        steps = len(trajectory)
+        raw = self.raw_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
+        return self._if_done(self._scaled(raw), trajectory.signals)
+
+    def member_returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
+        """The summed member_rewards() of each trajectory, (E, N)."""
+        return np.stack([self.member_rewards(trajectory).sum(axis=-1) for trajectory in trajectories], axis=1)
 
     def rewards_of(self, trajectory: Trajectory) -> FloatArray:
         """Mean over members of the normalised reward of every step, (T,)."""

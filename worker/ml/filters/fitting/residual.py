@@ -49,7 +49,7 @@ def train_residual(
         started = time.perf_counter()
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
         draft = draft.timed("residual_rollouts", started)
-        returns = problem.reward.returns(rounds[-1])
+        returns = problem.reward.member_returns(rounds[-1]).mean(axis=0)
         if earned is None or not _clearly_below(returns, earned):
             kept, earned = draft, returns
         else:
@@ -132,7 +132,8 @@ def _flat(rounds: Sequence[Sequence[Trajectory]]) -> list[Trajectory]:
 
 
 def _transitions(problem: FilterProblem, trajectory: Trajectory) -> Transitions:
-    return Transitions.of(trajectory.observations, trajectory.actions, problem.reward.rewards_of(trajectory))
+    rewards = problem.reward.member_rewards(trajectory).mean(axis=0)
+    return Transitions.of(trajectory.observations, trajectory.actions, rewards)
 
 
 @dataclass(frozen=True)
