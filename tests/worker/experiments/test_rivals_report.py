@@ -64,6 +64,6 @@ def test_what_a_fit_needs_is_told(method: str) -> None:
 def test_a_table_whose_writing_fails_stays_as_it_was(tmp_path: Any) -> None:
     table = tmp_path / "rows.csv"
     result_tables.write(table, [{"user": "neutral", "gain": 1.5}])
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="gain"):
         result_tables.write(table, [{"user": "neutral"}, {"user": "cautious", "gain": 2.5}])
     assert result_tables.read(table) == [{"user": "neutral", "gain": "1.5"}]

@@ -314,7 +314,7 @@ def test_what_was_driven_is_judged_beyond_what_was_shown_if_the_task_got_done() 
     for driven, speed in ((shown, 0.1), (faster, 40.0), (failing, 40.0)):
         driven.signals[:, SIGNALS.index("speed_m_s")] = speed
     failing.signals[:, undone] = 1.0
-    assert model.returns([shown]) == pytest.approx(model.returns([faster])), "a policy that is trained has no use for more"
+    assert model.returns([shown]) == pytest.approx(model.returns([faster])), "what may do anything has no use for more"
     worth = model.member_returns([shown, faster, failing])
     np.testing.assert_allclose(worth, np.tile([15 * 0.05, 15 * 20.0, 0.0], (8, 1)), rtol=1e-6)
 

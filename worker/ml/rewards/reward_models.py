@@ -109,8 +109,9 @@ class RewardModel(ABC):
     def member_rewards(self, trajectory: Trajectory) -> FloatArray:
         """What each step is worth to every member, (E, T): as episode_rewards(), but not clipped nor limited.
 
-        Clipping and limits keep a policy that may do anything from what nobody has seen. What stays near a mode, and what
-        is judged, goes by these: else nothing is better for a person than the most of what they like that a clip showed.
+        Clipping and limits keep a policy that may do anything from what nobody has seen. What stays near a mode, and
+        what is judged, goes by these: else nothing is better for a person than the most of what they like that a clip
+        ever showed.
         """
         steps = len(trajectory)
         raw = self.raw_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
