@@ -214,13 +214,13 @@ def test_rewards_have_mean_0_and_deviation_1_over_the_reference_rollouts(model: 
     assert rewards.std() == pytest.approx(1, abs=1e-6)
 
 
-def test_one_broken_step_cannot_decide_an_episode() -> None:
+def test_one_broken_step_cannot_decide_what_is_trained() -> None:
     signals = np.zeros((20, len(SIGNALS)))
     signals[3] = 1e6
     broken = invented.trajectory(np.random.default_rng(0), signals=signals)
     model = StructuredReward(np.ones((8, len(SIGNALS))))
     assert model.rewards_of(broken).max() == CLIP
-    assert model.returns([broken])[0] == pytest.approx(CLIP)
+    assert model.rewards_of(broken).sum() == pytest.approx(CLIP)
 
 
 def test_a_model_survives_storage(model: RewardModel) -> None:
@@ -314,9 +314,11 @@ def test_what_was_driven_is_judged_beyond_what_was_shown_if_the_task_got_done() 
     for driven, speed in ((shown, 0.1), (faster, 40.0), (failing, 40.0)):
         driven.signals[:, SIGNALS.index("speed_m_s")] = speed
     failing.signals[:, undone] = 1.0
-    assert model.returns([shown]) == pytest.approx(model.returns([faster])), "what may do anything has no use for more"
+    trained_on = [model.rewards_of(each).sum() for each in (shown, faster)]
+    assert trained_on[0] == pytest.approx(trained_on[1]), "what may do anything has no use for more"
     worth = model.member_returns([shown, faster, failing])
     np.testing.assert_allclose(worth, np.tile([15 * 0.05, 15 * 20.0, 0.0], (8, 1)), rtol=1e-6)
+    np.testing.assert_allclose(model.returns([shown, faster, failing]), worth[0], rtol=1e-6)
 
 
 def test_whole_episodes_count_as_shown_beside_the_clips(labelled: tuple[SegmentPairs, np.ndarray]) -> None:

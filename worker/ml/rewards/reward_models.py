@@ -102,10 +102,6 @@ class RewardModel(ABC):
         """What the episode is worth whether or not the task gets done, as episode_rewards()."""
         return self.step_rewards(signals, observations, actions)
 
-    def returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
-        """Mean over members of the summed normalised rewards of each trajectory, (N,)."""
-        return np.array([self.rewards_of(trajectory).sum() for trajectory in trajectories])
-
     def member_rewards(self, trajectory: Trajectory) -> FloatArray:
         """What each step is worth to every member, (E, T): as episode_rewards(), but not clipped nor limited.
 
@@ -121,8 +117,13 @@ class RewardModel(ABC):
         """The summed member_rewards() of each trajectory, (E, N)."""
         return np.stack([self.member_rewards(trajectory).sum(axis=-1) for trajectory in trajectories], axis=1)
 
+    def returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
+        """Mean over members of what each trajectory is worth, (N,): by what is judged and shown."""
+        mean: FloatArray = self.member_returns(trajectories).mean(axis=0)
+        return mean
+
     def rewards_of(self, trajectory: Trajectory) -> FloatArray:
-        """Mean over members of the normalised reward of every step, (T,)."""
+        """Mean over members of episode_rewards(), (T,): what a policy is trained on."""
         steps = len(trajectory)
         rewards = self.episode_rewards(trajectory.signals, trajectory.observations[:steps], trajectory.actions)
         mean: FloatArray = rewards.mean(axis=0)

@@ -49,7 +49,7 @@ def train_residual(
         started = time.perf_counter()
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
         draft = draft.timed("residual_rollouts", started)
-        returns = problem.reward.member_returns(rounds[-1]).mean(axis=0)
+        returns = problem.reward.returns(rounds[-1])
         if earned is None or not _clearly_below(returns, earned):
             kept, earned = draft, returns
         else:
