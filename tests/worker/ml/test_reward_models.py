@@ -319,6 +319,7 @@ def test_what_was_driven_is_judged_beyond_what_was_shown_if_the_task_got_done() 
     worth = model.member_returns([shown, faster, failing])
     np.testing.assert_allclose(worth, np.tile([15 * 0.05, 15 * 20.0, 0.0], (8, 1)), rtol=1e-6)
     np.testing.assert_allclose(model.returns([shown, faster, failing]), worth[0], rtol=1e-6)
+    assert model.returns([]).shape == (0,)
 
 
 def test_whole_episodes_count_as_shown_beside_the_clips(labelled: tuple[SegmentPairs, np.ndarray]) -> None:

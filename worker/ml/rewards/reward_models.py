@@ -115,7 +115,8 @@ class RewardModel(ABC):
 
     def member_returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
         """The summed member_rewards() of each trajectory, (E, N)."""
-        return np.stack([self.member_rewards(trajectory).sum(axis=-1) for trajectory in trajectories], axis=1)
+        returns = [self.member_rewards(trajectory).sum(axis=-1) for trajectory in trajectories]
+        return np.array(returns).reshape(len(returns), self.size).T
 
     def returns(self, trajectories: Sequence[Trajectory]) -> FloatArray:
         """Mean over members of what each trajectory is worth, (N,): by what is judged and shown."""
