@@ -24,14 +24,15 @@ from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Promise, harms, outcome_of
 from worker.compute import simulation
+from worker.compute.filter_finishing import usually_at_most
 from worker.domain.scenarios import PROMISE_TEST, first_of
 from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell, default_method
 from worker.experiments.rollout_cache import RolloutCache
+from worker.ml.export.run_filter import strong_share, unusual_activity
 from worker.ml.filters.exported.filter_act import FilterAct
-from worker.ml.filters.exported.filter_onnx import SHIELD
 from worker.ml.methods import registry as methods
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.bullet import Bullet
@@ -183,6 +184,7 @@ def _row(
     before, after = (_summed(bench, preference_rewards, some) for some in (reference, filtered))
     gains = 100.0 * (after - before) / _summed(bench, stakes, reference).mean()
     outcomes = [[outcome_of(each, bench.task) for each in some] for some in (reference, filtered)]
+    activities = [act.shield_activity(each) for each in filtered]
     harmed = sum(bool(harms(Promise(), *pair)) for pair in zip(*outcomes, strict=True))
     return {
         "scenarios": len(gains),
@@ -193,7 +195,8 @@ def _row(
         "harmed": harmed,
         "worst_force_n": f"{max(each.largest_force_n for each in outcomes[1]):.1f}",
         "worst_force_reference_n": f"{max(each.largest_force_n for each in outcomes[0]):.1f}",
-        "shield_active": f"{_shield_active(act, filtered):.4f}",
+        "shield_active": f"{(np.concatenate(activities) > 0.0).mean():.4f}",
+        "shield_strong": " ".join(f"{strong_share(each):.2f}" for each in activities),
     }
 
 
@@ -203,16 +206,6 @@ def _summed(bench: BenchmarkUser, measure: Any, some: Sequence[Trajectory]) -> F
     return np.array(
         [measure(bench.task, t.costs, t.signals, taste.omega, "calibrated", taste.per_signal).sum() for t in some]
     )
-
-
-def _shield_active(act: FilterAct, filtered: Sequence[Trajectory]) -> float:
-    """In what share of steps the shield did something."""
-    if not act.exported.is_shielded:
-        return 0.0
-    observations = np.concatenate([each.observations[:-1] for each in filtered])
-    means = np.concatenate([each.reference_actions for each in filtered])
-    (activity,) = act.exported.run(observations, means, [SHIELD])
-    return float((activity > 0.0).mean())
 
 
 def _write(rows: Sequence[Mapping[str, Any]], output: Path) -> None:
@@ -233,29 +226,41 @@ def _tables(rows: Sequence[Mapping[str, Any]]) -> str:
             "",
             "| changed | "
             + " | ".join(f"{user}: gain, %" for user in users)
-            + " | success, points | of the reference, % | harmed | worst force, N | of the reference | shield, % |",
-            "|---" * (len(users) + 7) + "|",
+            + " | success, points | of the reference, % | harmed | worst force, N | of the reference | shield, % |"
+            + " told |",
+            "|---" * (len(users) + 8) + "|",
         ]
+        usual = {row["user"]: _strong_shares(row) for row in some if row["change"] == "nothing"}
         for change in CHANGES:
             found = {row["user"]: row for row in some if row["change"] == change}
             if found:
-                lines.append(_line(change, [found.get(user) for user in users]))
+                lines.append(_line(change, [found.get(user) for user in users], usual))
         lines.append("")
     return "\n".join(lines)
 
 
-def _line(change: str, rows: Sequence[Mapping[str, Any] | None]) -> str:
+def _line(change: str, rows: Sequence[Mapping[str, Any] | None], usual: Mapping[str, list[float]]) -> str:
     here = [row for row in rows if row]
     driven = sum(int(row["scenarios"]) for row in here)
     successes = [sum(int(row[name]) for row in here) / driven for name in ("successes", "successes_reference")]
     worst = [max(float(row[name]) for row in here) for name in ("worst_force_n", "worst_force_reference_n")]
     shield = np.mean([float(row["shield_active"]) for row in here])
+    told = [
+        bool(unusual_activity(share, usually_at_most(usual[row["user"]])))
+        for row in here
+        for share in _strong_shares(row)
+    ]
     return (
         f"| {change} | {' | '.join(_gain(row) if row else '-' for row in rows)}"
         f" | {100 * (successes[0] - successes[1]):+.1f} | {100 * successes[1]:.1f}"
         f" | {sum(int(row['harmed']) for row in here)} of {driven} | {worst[0]:.1f} | {worst[1]:.1f}"
-        f" | {100 * shield:.1f} |"
+        f" | {100 * shield:.1f} | {f'{sum(told)} of {len(told)}' if told else '-'} |"
     )
+
+
+def _strong_shares(row: Mapping[str, Any]) -> list[float]:
+    """Of every episode."""
+    return [float(share) for share in row["shield_strong"].split()]
 
 
 def _gain(row: Mapping[str, Any]) -> str:

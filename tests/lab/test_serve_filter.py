@@ -26,8 +26,9 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.experiments.lab_ranges import first_found
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
-from worker.ml.export.filter_loop import FilterLoop, Refused, require_same
+from worker.ml.export.filter_loop import FilterLoop, Refused, Run, require_same
 from worker.ml.export.interface import interface_of
+from worker.ml.filters.exported import shield
 from worker.ml.filters.exported.filter_act import FilterAct, act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.policies import asked_policy
@@ -62,7 +63,7 @@ class Plane:
     def loop(self, deadline_s: float = 5.0, pause_s: float = 60.0) -> FilterLoop:
         return FilterLoop(
             interface_of(self.task, self.policy),
-            self.filter.exported.batch,
+            unshielded(self.filter),
             PolicyServer(self.url),
             deadline_s,
             pause_s,
@@ -81,6 +82,11 @@ def plane_of(plane: Path) -> Iterator[Callable[..., Plane]]:
 
         yield make
     asked_policy.forget()
+
+
+def unshielded(act: FilterAct) -> Run:
+    """As run_filter.run() says it of a filter without a shield."""
+    return lambda seen, mean: (act.exported.batch(seen, mean), np.zeros((len(seen), 1)))
 
 
 def of(answer: dict[str, Any]) -> tuple[str, list[float]]:
@@ -224,7 +230,7 @@ def test_a_bundle_of_ours_says_units_frame_and_rate_and_takes_its_fields_by_name
     with pytest.raises(Refused, match="is of fingerprint"):
         require_same("somebody", {"fingerprint": "00"}, interface)
     act = act_of(invented.TASK.modes, policy, FilterWeights(mode={"speed_near": -0.5}))
-    loop = FilterLoop(interface, act.exported.batch, policy.mean, 5.0, 60.0)
+    loop = FilterLoop(interface, unshielded(act), policy.mean, 5.0, 60.0)
     seen = np.zeros(invented.TASK.observation.size, np.float32) + 0.1
     parts = {field.name: seen[place] for field, place in invented.TASK.observation.slices()}
     tables = {name: part.reshape(1, -1, 1) for name, part in parts.items()}
@@ -232,6 +238,35 @@ def test_a_bundle_of_ours_says_units_frame_and_rate_and_takes_its_fields_by_name
         np.testing.assert_allclose(loop.answer(packed(message))["actions"][0], act(seen), atol=1e-6)
     with pytest.raises(Refused, match=r"tool_position_m is .* look at units and frame"):
         loop.answer(packed(parts | {"tool_position_m": np.full(3, 500.0)}))
+    loop.close()
+
+
+def test_a_shield_that_acts_more_than_in_tests_is_told_once_an_episode_has_been_seen() -> None:
+    policy, size = invented.small_policy(), invented.TASK.observation.size
+    limits = shield.widest(invented.TASK.observation, policy.action_size)
+    limits["observation_high"][0], limits["observation_ramp"][0] = 0.5, 1.0
+    act = act_of(invented.TASK.modes, policy, FilterWeights(mode={"speed_near": -0.5}, shield=limits))
+    interface = interface_of(invented.TASK, policy)
+    loop = FilterLoop(interface, act.exported.run, policy.mean, 5.0, 60.0)
+    loop.usual_strong_share = 0.2
+
+    def episode(first: float) -> list[dict[str, Any]]:
+        seen = np.full(size, 0.1, np.float32)
+        seen[0] = first
+        return [loop.answer(packed({"observation": seen}))["filter"] for _ in range(interface["episode_steps"])]
+
+    for first, slightly in ((0.1, False), (0.6, True)):
+        said = episode(first)
+        assert {(0.0 < each["shield"] < 0.05, each["why"]) for each in said} == {(slightly, "")}
+    said = episode(1.5)
+    assert {each["shield"] for each in said} == {1.0}
+    told = [bool(each["why"]) for each in said]
+    assert told.index(True) == 0.2 * len(said)
+    assert all(told[told.index(True) :])
+    assert said[-1]["why"].startswith("in 100% of the steps the shield takes back a quarter or more of what the filter")
+    assert f"the shield active in {2 * len(said)}" in str(loop.counted)
+    loop.begin_connection()
+    assert not any(each["why"] for each in episode(1.5)[:-1])
     loop.close()
 
 
@@ -245,7 +280,7 @@ def test_an_environment_with_goals_has_a_field_called_observation_and_is_asked_b
         **{other.name: list(range(at.start, at.stop)) for other, at in others},
     }
     interface |= {"observation": fields, "policy": interface["policy"] | {"inputs": inputs}}
-    loop = FilterLoop(interface, lambda seen, mean: mean, policy.mean, 5.0, 60.0)
+    loop = FilterLoop(interface, lambda seen, mean: (mean, np.zeros((1, 1))), policy.mean, 5.0, 60.0)
     seen = np.zeros(invented.TASK.observation.size, np.float32) + 0.1
     parts = {"observation": seen[place], **{other.name: seen[at] for other, at in others}}
     whole, by_fields = (loop.answer(packed(each))["actions"] for each in ({"observation": seen}, parts))
@@ -311,7 +346,7 @@ def test_a_bundle_stands_between_a_policy_server_and_a_client(plane_of: Callable
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate()
     assert process.returncode == 0
-    assert "40 steps (40 ok), rate " in out
+    assert "40 steps (40 ok), the shield active in 0, rate " in out
     assert out.endswith("Ended.\n")
 
 

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from app.installed_tasks.lab import REFERENCE
 from worker.analysis.filters.evaluation import evaluate
 from worker.analysis.filters.promise import sentence
@@ -15,9 +17,9 @@ from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
+from worker.ml.export.run_filter import strong_share
 from worker.ml.filters.exported.filter_act import FilterAct
 from worker.ml.filters.exported.filter_module import FilterWeights
-from worker.ml.filters.exported.filter_onnx import SHIELD
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.policy_choice import SURE
 from worker.tasks import registry
@@ -75,7 +77,7 @@ def finish(fit: FilterFit, draft: FilterDraft, provenance: Provenance, learned: 
         "evaluation": evaluation,
         "uses_reference": draft.weights.moves_nothing,
         "promise": _promised(draft, task),
-        "shield_active": _shield_active(proven),
+        **_shield_activity(proven),
         "rejected": proven.rejected,
         **_strengths(draft.weights),
         "mode": dict(draft.weights.mode),
@@ -163,13 +165,20 @@ def _choice(task: Task, draft: FilterDraft) -> dict[str, Any] | None:
     return {"policy": policy, "chances": dict(draft.choice), "sure": draft.choice[policy] >= SURE}
 
 
-def _shield_active(proven: Proven) -> float | None:
-    """In what share of the evaluation's steps the shield did something; None: there is none."""
+def _shield_activity(proven: Proven) -> dict[str, float]:
+    """In what share of the evaluation's steps the shield did something, and in an episode's at most much."""
     if not proven.act.exported.is_shielded:
-        return None
-    steps = RecordedSteps.of(proven.driven)
-    (activity,) = proven.act.exported.run(steps.observations, steps.policy_means, [SHIELD])
-    return round(float((activity > 0.0).mean()), 4)
+        return {}
+    activities = [proven.act.shield_activity(each) for each in proven.driven]
+    return {
+        "shield_active": round(float((np.concatenate(activities) > 0.0).mean()), 4),
+        "shield_strong_at_most": round(usually_at_most([strong_share(each) for each in activities]), 4),
+    }
+
+
+def usually_at_most(shares: Sequence[float]) -> float:
+    """What 99 of 100 episodes do not exceed; with fewer of them the largest."""
+    return float(np.quantile(shares, 0.99, method="higher"))
 
 
 def _strengths(weights: FilterWeights) -> dict[str, float]:

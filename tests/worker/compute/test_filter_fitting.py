@@ -54,6 +54,14 @@ def test_a_filter_that_costs_more_success_than_allowed_warns_against_its_use(del
     assert all("Do not run this filter on a person" in warning for warning in warnings)
 
 
+@pytest.mark.parametrize("episodes", [40, 120, 500])
+def test_a_usual_episode_rarely_counts_as_unusual(episodes: int) -> None:
+    rng = np.random.default_rng(episodes)
+    shares = rng.beta(0.2, 2.0, (4000, episodes + 1))
+    false_alarms = [share > filter_finishing.usually_at_most(tested) for share, *tested in shares]
+    assert 0.005 < np.mean(false_alarms) < 0.035
+
+
 class Drives(AtHand):
     """Drives nothing, and knows where it should have."""
 

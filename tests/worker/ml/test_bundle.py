@@ -246,12 +246,17 @@ def test_without_policy_means_the_bundle_asks_its_own_policy(unzipped: Path, con
 def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, tmp_path: Path) -> None:
     recording, family = contents.recording, invented.TASK.modes
     limits = shield.widest(invented.TASK.observation, 7)
-    limits["observation_high"][0] = np.median(recording.observations[:, 0])
+    limits["observation_high"][0] = np.quantile(recording.observations[:, 0], 0.2)
     limits["observation_ramp"][0] = 1e-3
     weights = contents.weights.changed(shield=limits)
     stored = to_onnx(build(family, POLICY, weights), recording.observations, recording.policy_means)
     sentence = "With 95 % confidence, in at most 5 % of scenarios it does nothing of the kind."
-    metrics = {**contents.metrics, "shield_active": 0.5, "promise": {"share": 0.05, "sentence": sentence}}
+    metrics = {
+        **contents.metrics,
+        "shield_active": 0.5,
+        "shield_strong_at_most": 0.5,
+        "promise": {"share": 0.05, "sentence": sentence},
+    }
     written = bundle.write(replace(contents, weights=weights, filter_onnx=stored, metrics=metrics))
     with zipfile.ZipFile(io.BytesIO(written)) as archive:
         archive.extractall(tmp_path)
@@ -270,7 +275,12 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     assert run(tmp_path).returncode == 0
     np.save(tmp_path / "o.npy", recording.observations)
     finished = run(tmp_path, "--observations", "o.npy", "--output", "a.npy")
-    assert f"the shield was active in 20 of {len(recording.observations)} rows" in finished.stdout
+    assert f"the shield was active in 32 of {len(recording.observations)} rows" in finished.stdout
+    assert "in 80% of the steps the shield takes back a quarter or more" in finished.stdout
+    assert "in 99 of 100 episodes of its tests in 50% at most" in finished.stdout
+    first = recording.observations[:, 0]
+    np.save(tmp_path / "o.npy", recording.observations[first < np.quantile(first, 0.3)])
+    assert "takes back" not in run(tmp_path, "--observations", "o.npy", "--output", "a.npy").stdout
 
 
 def test_a_filter_without_promise_and_shield_says_so(contents: BundleContents) -> None:
@@ -286,7 +296,7 @@ def test_the_exported_policy_is_the_shipped_one() -> None:
     observations = np.random.default_rng(0).standard_normal((50, len(policy.offset))).astype(np.float32)
     session = onnxruntime.InferenceSession(policy_to_onnx(policy))
     (means,) = session.run(["policy_mean"], {"observation": observations})
-    np.testing.assert_allclose(means, policy.mean(observations), atol=1e-6)
+    np.testing.assert_allclose(means, policy.mean(observations), atol=1e-5)  # processors round differently
 
 
 @pytest.mark.parametrize(

@@ -213,12 +213,17 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
 
 
 def _shield(contents: BundleContents) -> dict[str, Any] | None:
-    """The limits inside the filter, and in how many of the evaluation's steps they were left; None: no shield."""
+    """The limits inside the filter, and how active it was in the evaluation; None: no shield."""
     limits, task = contents.weights.shield, contents.task
     if not limits:
         return None
     described = shield.described(task.observation, task.action, limits)
-    return {"output": SHIELD, "limits": described, "active_share": contents.metrics.get("shield_active")}
+    return {
+        "output": SHIELD,
+        "limits": described,
+        "active_share": contents.metrics.get("shield_active"),
+        "strong_share_at_most": contents.metrics.get("shield_strong_at_most"),
+    }
 
 
 def described_space(space: Space) -> dict[str, Any]:

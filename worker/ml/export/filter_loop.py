@@ -2,8 +2,8 @@
 
 A client's message goes to the policy server as it came; a policy that is a function is called in this process instead.
 Of the chunk that comes back, the actions are filtered one at a time, each with a fresh observation, and the client gets
-one action (1, A) in the policy's own units, with ``filter``: in which state the loop is, and why. The first message of
-a connection begins an episode, and so does one that says ``"reset": true``.
+one action (1, A) in the policy's own units, with ``filter``: in which state the loop is and why, and how active the
+shield was. The first message of a connection begins an episode, and so does one that says ``"reset": true``.
 
 The watchdog: an answer later than the deadline gives the last action at half, a quarter, an eighth of it ("slow"), then
 zero ("stop"), until the policy is in time again; actions that do not move the robot, a gripper's, stay as they were. A
@@ -14,7 +14,8 @@ must stop it when this loop says nothing at all.
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 
 if __package__:
+    from worker.ml.export.run_filter import strong_share, unusual_activity
     from worker.ml.policies.policy_client import (
         PolicyFunction,
         PolicyServer,
@@ -40,9 +42,10 @@ else:  # in a bundle it lies beside this file
         packed,
         unpacked,
     )
+    from run_filter import strong_share, unusual_activity  # type: ignore[import-not-found, no-redef]  # in bundles
 
-Run = Callable[[Any, Any], Any]
-"""(N, D), (N, A) -> (N, A): the filter; both in the studio's units"""
+Run = Callable[[Any, Any], Sequence[Any]]
+"""(N, D), (N, A) -> (N, A), (N, 1): the filter, in the studio's units, and the activity of its shield"""
 Means = Callable[[Any], Any]
 """(N, D) -> (N, A): the policy in the bundle"""
 FAR_OUTSIDE = 10.0
@@ -68,6 +71,7 @@ class Counted:
     steps: int = 0
     states: dict[str, int] = field(default_factory=dict)
     pauses: int = 0
+    shielded: int = 0
     whole_ms: list[float] = field(default_factory=list)
     policy_ms: list[float] = field(default_factory=list)
     filter_ms: list[float] = field(default_factory=list)
@@ -84,13 +88,16 @@ class Counted:
         rate = "unknown" if self.rate_hz is None else f"{self.rate_hz:.1f} Hz"
         states = ", ".join(f"{count} {state}" for state, count in sorted(self.states.items())) or "none"
         return (
-            f"{self.steps} steps ({states}), rate {rate}, {self.pauses} pauses; whole {_spread(self.whole_ms)}, "
-            f"policy {_spread(self.policy_ms)}, filter {_spread(self.filter_ms)}"
+            f"{self.steps} steps ({states}), the shield active in {self.shielded}, rate {rate}, {self.pauses} pauses; "
+            f"whole {_spread(self.whole_ms)}, policy {_spread(self.policy_ms)}, filter {_spread(self.filter_ms)}"
         )
 
 
 class FilterLoop:
     """One robot's filter: what is between two messages is kept here. Raises Refused for messages of others."""
+
+    usual_strong_share: float | None = None
+    """of an episode's steps, in which its shield was strongly active in tests, at most; None: not known"""
 
     def __init__(
         self,
@@ -108,6 +115,7 @@ class FilterLoop:
         self._thread = ThreadPoolExecutor(1, "policy")
         self._asked: Future[Any] | None = None
         self.counted = Counted()
+        self._activities = deque[float](maxlen=interface["episode_steps"])
         self._step, self._late = 0, 0
         self._last_s: float | None = None
         self._previous: Any = None
@@ -117,6 +125,7 @@ class FilterLoop:
     def begin_connection(self) -> None:
         """Somebody else is there."""
         self.counted = Counted()
+        self._activities.clear()
         self._begin()
 
     def answer(self, stored: bytes) -> dict[str, Any]:
@@ -127,7 +136,7 @@ class FilterLoop:
             require_same("the client", message["interface"], self.interface)
         observation = self._observation(message)
         self._look_at_the_clock(now, bool(message.get("reset")))
-        state, why, others = "ok", "", dict[str, Any]()
+        state, why, shield, others = "ok", "", 0.0, dict[str, Any]()
         try:
             mean = self._mean(observation, stored, others)
         except Late:
@@ -141,15 +150,18 @@ class FilterLoop:
         if state == "ok":
             self._late = 0
             began = time.perf_counter()
-            action = np.asarray(self._run(self._whole(observation), mean[None])[0], np.float32)
+            actions, activity = self._run(self._whole(observation), mean[None])
+            action, shield = np.asarray(actions[0], np.float32), float(activity[0, 0])
             self.counted.filter_ms.append(1000 * (time.perf_counter() - began))
+            self.counted.shielded += shield > 0.0
+            self._activities.append(shield)
         else:
             action = self._slower(0.5 if state == "slow" else 0.0)
         self._previous, self._step = action, self._step + 1
         self.counted.steps += 1
         self.counted.states[state] = self.counted.states.get(state, 0) + 1
         self.counted.whole_ms.append(1000 * (time.perf_counter() - now))
-        said = {"state": state, "why": why or self._rate_note()}
+        said = {"state": state, "why": why or self._notes(), "shield": shield}
         return {**others, "actions": self._outside(action)[None], "filter": said}
 
     def first_said(self, observation: Any) -> Any:
@@ -261,6 +273,16 @@ class FilterLoop:
         """The last action with its motion multiplied."""
         slower = self._in_unit(factor * self._outside(self._previous))
         return np.where(self._moving, slower, self._previous).astype(np.float32)
+
+    def _notes(self) -> str:
+        """What else is not as it was in tests."""
+        return "; ".join(filter(None, (self._rate_note(), self._shield_note())))
+
+    def _shield_note(self) -> str:
+        """Of the last as many steps as an episode has: how active a shield is differs within it."""
+        if len(self._activities) < self.interface["episode_steps"]:
+            return ""
+        return unusual_activity(strong_share(np.array(self._activities)), self.usual_strong_share)
 
     def _rate_note(self) -> str:
         rate, belongs = self.counted.rate_hz, self.interface["control_rate_hz"]

@@ -32,6 +32,7 @@ import importlib
 import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,9 @@ except ImportError as missing:
 TOLERANCE = 1e-4
 """Largest accepted difference from the recorded actions: other processors round differently."""
 TIMED_STEPS = 300
+STRONG = 0.25
+"""Activity of the shield from which it counts when somebody's world is compared with the tests'. Below, it is often
+there throughout an episode, for a posture that was rare in them (docs/results/changed_physics.md)."""
 SIGNATURE_FORMAT = "pbarl-studio-bundle-signature"
 
 
@@ -190,18 +194,43 @@ def serve(manifest: dict[str, Any], session: Any, policy: Any, options: argparse
     return code
 
 
-def run(session: Any, observations: Any, policy_means: Any) -> Any:
-    """(N, D), (N, A) -> (N, A)"""
-    return session.run(["action"], {"observation": observations, "policy_mean": policy_means})[0]
+def run(session: Any, observations: Any, policy_means: Any) -> tuple[Any, Any]:
+    """(N, D), (N, A) -> actions (N, A), activity of the shield (N, 1). Filters of earlier versions have no shield."""
+    names = [output.name for output in session.get_outputs()]
+    said = session.run(names, {"observation": observations, "policy_mean": policy_means})
+    found = dict(zip(names, said, strict=True))
+    return found["action"], found.get("shield", np.zeros((len(observations), 1), np.float32))
 
 
-def shielded(session: Any, observations: Any, policy_means: Any) -> list[str]:
-    """In how many rows the shield was active. Filters of earlier versions have none."""
-    if "shield" not in [output.name for output in session.get_outputs()]:
+def usual_strong_share(manifest: Mapping[str, Any]) -> float | None:
+    """What strong_share() was at most in 99 of 100 episodes of the tests; None: not known."""
+    share: float | None = (manifest.get("shield") or {}).get("strong_share_at_most")
+    return share
+
+
+def strong_share(activity: Any) -> float:
+    """(N, 1) -> in what share of the steps the shield took back a good part of what the filter did."""
+    return float((activity >= STRONG).mean())
+
+
+def unusual_activity(share: float, usual: float | None) -> str:
+    """What it means that the shield is as active as this in as many steps as an episode has; empty: it is usual."""
+    if usual is None or share <= usual:
+        return ""
+    return (
+        f"in {share:.0%} of the steps the shield takes back a quarter or more of what the filter does, in 99 of 100 "
+        f"episodes of its tests in {usual:.0%} at most: sensors or surroundings are other than there, and the task may "
+        "fail"
+    )
+
+
+def shielded(manifest: Mapping[str, Any], activity: Any) -> list[str]:
+    """In how many rows the shield was active, and whether that is unusual."""
+    rows = int((activity > 0).sum())
+    if not rows:
         return []
-    feed = {"observation": observations, "policy_mean": policy_means}
-    rows = int((session.run(["shield"], feed)[0] > 0).sum())
-    return [f"the shield was active in {rows} of {len(observations)} rows."] if rows else []
+    unusual = unusual_activity(strong_share(activity), usual_strong_share(manifest))
+    return [f"the shield was active in {rows} of {len(activity)} rows.", *([f"{unusual}."] if unusual else [])]
 
 
 def means_of(policy: Any, observations: Any) -> Any:
@@ -214,7 +243,7 @@ def compare_with_recording(manifest: dict[str, Any], session: Any, policy: Any, 
     observations, policy_means = read_inputs(manifest, directory / "observations.npy", directory / "policy_means.npy")
     recorded = read_array(directory / "actions.npy", manifest["action"]["size"])
     started = time.perf_counter()
-    actions = run(session, observations, policy_means)
+    actions, _ = run(session, observations, policy_means)
     all_at_once_ms = 1000 * (time.perf_counter() - started)
     difference = float(np.abs(actions - recorded).max())
     if policy is not None:
@@ -248,8 +277,8 @@ def filter_files(manifest: dict[str, Any], session: Any, observed: Path, means: 
         policy_means = means_of(means, observations)
     for line in unusual(manifest["observation"], observations):
         sys.stdout.write(f"Note: {line}\n")
-    actions = run(session, observations, policy_means)
-    for line in shielded(session, observations, policy_means):
+    actions, activity = run(session, observations, policy_means)
+    for line in shielded(manifest, activity):
         sys.stdout.write(f"Note: {line}\n")
     try:
         with output.open("wb") as target:

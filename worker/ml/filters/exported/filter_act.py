@@ -7,10 +7,11 @@ import numpy as np
 import torch
 
 from worker.domain.modes import ModeFamily
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.encoders.action_encoder import ResidualAdapter
 from worker.ml.filters.exported.filter_module import FilterWeights, build, state_of
-from worker.ml.filters.exported.filter_onnx import OnnxFilter, to_onnx
+from worker.ml.filters.exported.filter_onnx import SHIELD, OnnxFilter, to_onnx
 from worker.ml.filters.exported.shield import widest
 from worker.ml.filters.exported.touch_limit import NAMES
 from worker.ml.policies.asked_policy import AskedPolicy
@@ -32,6 +33,13 @@ class FilterAct:
     def batch(self, observations: Float32Array) -> Float32Array:
         """(B, D) -> (B, 7)"""
         return self.exported.batch(observations, self.policy.mean(observations))
+
+    def shield_activity(self, driven: Trajectory) -> Float32Array:
+        """(T, 1) of its shield, 0 where there is none."""
+        seen = driven.observations[:-1]
+        if not self.exported.is_shielded:
+            return np.zeros((len(seen), 1), np.float32)
+        return self.exported.run(seen, driven.reference_actions, [SHIELD])[0]
 
 
 def trace(family: ModeFamily, policy: ReferencePolicy) -> None:
