@@ -10,7 +10,7 @@ The bundle is unzipped; without ``upstream`` the policy is its own. Topics, all 
     ~/reset        in   Empty              an episode begins; also goes on after "refused"
     ~/action       out  Float64MultiArray  at the manifest's rate, in the policy's unit (as ros2_control's
                                            forward_command_controller takes its commands)
-    ~/state        out  String             ok, slow, stop, stale, refused, and why
+    ~/state        out  String             ok, slow, stop, stale, refused, and why; or what is unlike the tests
 
 The loop is the bundle's own, so watchdog and shield are those of ``run_filter.py --serve``: a policy
 that is late slows the robot and then stops it. Beside that, an observation older than ``stale_s`` stops it, and so does
@@ -58,6 +58,7 @@ class Between:
             deadline_s or self.step_s,
             self._stale_s,
         )
+        self._loop.usual_strong_share = (manifest.get("shield") or {}).get("strong_share_at_most")
         self._loop.begin_connection()
         self._moving = np.isin(np.arange(len(self.interface["action"]["names"])), self.interface["action"]["moving"])
         self._observation: Any = None
