@@ -255,18 +255,21 @@ def test_a_shield_that_acts_more_than_in_tests_is_told_once_an_episode_has_been_
         seen[0] = first
         return [loop.answer(packed({"observation": seen}))["filter"] for _ in range(interface["episode_steps"])]
 
+    def tells(said: dict[str, Any]) -> bool:
+        return "the steps the shield takes back a quarter or more of what the filter does" in said["why"]
+
     for first, slightly in ((0.1, False), (0.6, True)):
         said = episode(first)
-        assert {(0.0 < each["shield"] < 0.05, each["why"]) for each in said} == {(slightly, "")}
+        assert {(0.0 < each["shield"] < 0.05, tells(each)) for each in said} == {(slightly, False)}
     said = episode(1.5)
     assert {each["shield"] for each in said} == {1.0}
-    told = [bool(each["why"]) for each in said]
+    told = [tells(each) for each in said]
     assert told.index(True) == 0.2 * len(said)
     assert all(told[told.index(True) :])
-    assert said[-1]["why"].startswith("in 100% of the steps the shield takes back a quarter or more of what the filter")
+    assert "in 100% of the steps the shield" in said[-1]["why"]
     assert f"the shield active in {2 * len(said)}" in str(loop.counted)
     loop.begin_connection()
-    assert not any(each["why"] for each in episode(1.5)[:-1])
+    assert not any(tells(each) for each in episode(1.5)[:-1])
     loop.close()
 
 
