@@ -166,7 +166,7 @@ def _choice(task: Task, draft: FilterDraft) -> dict[str, Any] | None:
 
 
 def _shield_activity(proven: Proven) -> dict[str, float]:
-    """In what share of the evaluation's steps the shield did something, and in an episode's at most much."""
+    """The share of the evaluation's steps with any activity of the shield, and the usual limit of strong_share()."""
     if not proven.act.exported.is_shielded:
         return {}
     activities = [proven.act.shield_activity(each) for each in proven.driven]
