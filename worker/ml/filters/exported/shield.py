@@ -66,7 +66,7 @@ class Shield(nn.Module):
         action = mean + (1.0 - activity) * change
         if self.touch is None:
             return action, activity
-        action, taken = self.touch(observation, action)
+        action, taken = self.touch(observation, mean, action)
         return action, torch.maximum(activity, taken)
 
 
@@ -109,7 +109,8 @@ def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
     if places.keys() >= touch_limit.FIELDS:
         joints = len(range(observation.size)[places[touch_limit.JOINTS]])
         limits["touch_motion"] = np.ones((joints + 1, action_size + 1, 3), np.float32)
-        limits["touch_depth"] = np.array([1e6], np.float32)
+        limits["touch_depth"] = np.array([touch_limit.NO_LIMIT_M], np.float32)
+        limits["touch_place"] = np.array([0.0, touch_limit.NO_LIMIT_M], np.float32)
     return limits
 
 

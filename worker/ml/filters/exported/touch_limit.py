@@ -1,11 +1,15 @@
-"""How hard a step may reach the skin: none goes deeper towards the person than the reference policy's touches do.
+"""How a step may reach the skin: no deeper than the reference policy's touches, and beside the target hardly sooner.
 
     depth = -outward . (tool - target + motion),    motion = a J(q) + b(q)   m, where the step would end by itself
-    action' = action + near (limit - depth) g / |g|^2,    g = -J(q) outward        where depth > limit, else as it is
+    closer = -outward . (a - mean) J(q)             m, that it leads nearer to the skin than the reference policy's would
+    excess = max(depth - deepest, beside (closer - CLOSING height)),    height = outward . (tool - target) - skin
+    action' = action + near excess g / |g|^2,       g = J(q) outward         where excess > 0, else as it is
 
 J and b are linear in the joint angles q. Most high forces are blows: the force follows how deep the step would end
-(decisions 168 and 169). Only the part of the action that leads into the skin is taken back, so whoever wants it fast
-keeps that along the skin; and never more than the whole action's size, whatever is foretold for postures never seen.
+(decisions 168 and 169). Beside the target, where the reference policy seldom touches, depth says little: there the
+robot may come nearer sooner than the reference policy only while it is still far from the skin (decision 175). Only the
+part of the action that leads into the skin is taken back, so whoever wants it fast keeps that along the skin; and never
+more than the whole action's size, whatever is foretold for postures never seen.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,41 +28,54 @@ FIELDS = {FORCE, DISTANCE, OUTWARD, JOINTS}
 """Of our tasks; a laboratory's lack some of them, and have no such limit."""
 NEAR_M, COMING_NEAR_M = 0.10, 0.05
 """Within the first it counts, on the way there the more the nearer."""
+BESIDE_M = 0.02
+"""So much farther from the target than usual touches of the reference policy, all of it is beside the target."""
+CLOSING = 0.1
+"""of the height above the skin that a step may lead nearer than the reference policy's"""
 TOUCH_N = 0.3
 """Forces from here on are touches."""
 USUAL = 0.95
-"""Quantile of the depths of the reference policy's steps that end in a touch, and of those that touch nobody. Where the
-latter is deeper, as with a cup's rim, depth says nothing about touches."""
+"""Quantile of what is said of the reference policy's steps that end in a touch: depth, height, distance to the target.
+Where that of the depths of steps that touch nobody is deeper, as with a cup's rim, depth says nothing about touches."""
 LEAST_STEPS, EXPLAINED = 1000, 0.7
 """Steps to learn the motion from, and what of the way into the skin has to follow from the action."""
 RIDGE = 1e-3
 """on the squares of the motion's coefficients"""
-NAMES = ("touch_motion", "touch_depth")
+NAMES = ("touch_motion", "touch_depth", "touch_place")
+"""of limits. The last has come later: filters made before go without."""
+NO_LIMIT_M = 1e6
 
 
 class TouchLimit(nn.Module):
-    """observation (B, D), action (B, A) -> action (B, A), the share of it that was taken back (B, 1) in [0, 1]."""
+    """observation (B, D), mean (B, A), action (B, A) -> action (B, A), the share that was taken back (B, 1) in [0, 1]."""
 
     touch_motion: Tensor
     touch_depth: Tensor
+    touch_place: Tensor
 
     def __init__(self, space: Space, limits: Mapping[str, Float32Array]) -> None:
         super().__init__()
         self.place, self.outward, self.joints = (space.slice_of(name) for name in (DISTANCE, OUTWARD, JOINTS))
         for name in NAMES:
-            self.register_buffer(name, torch.from_numpy(np.array(limits[name], np.float32)))
+            limit = limits.get(name, (0.0, NO_LIMIT_M))
+            self.register_buffer(name, torch.from_numpy(np.array(limit, np.float32)))
 
-    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, observation: Tensor, mean: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """See the module."""
         to_target, outward = observation[:, self.place], observation[:, self.outward]
         coefficients = _and_one(observation[:, self.joints]) @ self.touch_motion.flatten(1)
         coefficients = coefficients.reshape(-1, *self.touch_motion.shape[1:])
         motion = (_and_one(action).unsqueeze(1) @ coefficients).squeeze(1)
         depth = ((to_target - motion) * outward).sum(-1, keepdim=True)
-        near = ((NEAR_M + COMING_NEAR_M - length(to_target)) / COMING_NEAR_M).clamp(0.0, 1.0)
         inward = -(coefficients[:, :-1] @ outward.unsqueeze(2)).squeeze(2)
+        closer = ((action - mean) * inward).sum(-1, keepdim=True)
+        height = (-(to_target * outward).sum(-1, keepdim=True) - self.touch_place[0]).clamp(min=0.0)
+        away = length(to_target)
+        near = ((NEAR_M + COMING_NEAR_M - away) / COMING_NEAR_M).clamp(0.0, 1.0)
+        beside = ((away - self.touch_place[1]) / BESIDE_M).clamp(0.0, 1.0)
+        excess = torch.maximum(depth - self.touch_depth, beside * (closer - CLOSING * height)).clamp(min=0.0)
         size = (inward * inward).sum(-1, keepdim=True).clamp(min=1e-12)
-        taken = near * (depth - self.touch_depth).clamp(min=0.0) * inward / size
+        taken = near * excess * inward / size
         share = length(taken) / length(action).clamp(min=1e-6)
         return action - taken / share.clamp(min=1.0), share.clamp(max=1.0)
 
@@ -74,9 +91,10 @@ def _and_one(vectors: Tensor) -> Tensor:
 
 
 def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Float32Array]:
-    """How actions move the tool near the person, (J + 1, A + 1, 3) in m, and the usual depth of touches, (1,) in m.
+    """How actions move the tool near the person, (J + 1, A + 1, 3) in m, and how the reference policy touches.
 
-    Empty where the task does not observe what it takes, or touches do not follow from the actions.
+    That is the usual depth of its touches, (1,) in m; how high above the target the skin is met, and how far from the
+    target, (2,) in m. Empty where the task does not observe what it takes, or motions do not follow from the actions.
     """
     if not {field.name for field in space.fields} >= FIELDS:
         return {}
@@ -85,8 +103,9 @@ def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Flo
         for some in (slice(None, -1), slice(1, None))
     )
     actions = np.concatenate([each.actions for each in reference]).astype(np.float64)
-    near = np.linalg.norm(before[:, space.slice_of(DISTANCE)], axis=1) <= NEAR_M
-    before, after, actions = before[near], after[near], actions[near]
+    away = np.linalg.norm(before[:, space.slice_of(DISTANCE)], axis=1)
+    near = away <= NEAR_M
+    before, after, actions, away = before[near], after[near], actions[near], away[near]
     touch = after[:, space.slice_of(FORCE)][:, 0] >= TOUCH_N
     if len(touch) < LEAST_STEPS or touch.all() or not touch.any():
         return {}
@@ -102,13 +121,15 @@ def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Flo
         return along
 
     predicted = features @ learned
-    depth = along_outward(to_target - predicted)
-    limit = float(np.quantile(depth[touch], USUAL))
     missed = along_outward(motion - predicted).var() / max(along_outward(motion).var(), 1e-12)
-    if missed > 1.0 - EXPLAINED or limit <= np.quantile(depth[~touch], USUAL):
+    if missed > 1.0 - EXPLAINED:
         return {}
+    depth = along_outward(to_target - predicted)
+    deepest = np.quantile(depth[touch], USUAL)
+    if deepest <= np.quantile(depth[~touch], USUAL):
+        deepest = NO_LIMIT_M
+    place = [np.quantile(each[touch], USUAL) for each in (-along_outward(to_target), away)]
     shape = (joints.shape[1], with_one.shape[1], motion.shape[1])
-    return {
-        "touch_motion": learned.reshape(shape).astype(np.float32),
-        "touch_depth": np.array([limit], np.float32),
-    }
+    learned_motion = learned.reshape(shape)
+    limits = zip(NAMES, (learned_motion, [deepest], place), strict=True)
+    return {name: np.array(limit, np.float32) for name, limit in limits}
