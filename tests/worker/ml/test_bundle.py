@@ -248,6 +248,7 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     limits = shield.widest(invented.TASK.observation, 7)
     limits["observation_high"][0] = np.quantile(recording.observations[:, 0], 0.2)
     limits["observation_ramp"][0] = 1e-3
+    limits["touch_depth"][0] = 0.002
     weights = contents.weights.changed(shield=limits)
     stored = to_onnx(build(family, POLICY, weights), recording.observations, recording.policy_means)
     sentence = "With 95 % confidence, in at most 5 % of scenarios it does nothing of the kind."
@@ -265,8 +266,9 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     assert [output["name"] for output in manifest["onnx"]["outputs"]] == ["action", "shield"]
     (high, *_) = manifest["shield"]["limits"]["observation"][0]["high"]
     assert high == limits["observation_high"][0]
-    step = manifest["shield"]["limits"]["depth_of_step"]
-    assert step["deepest_m"] == limits["touch_depth"][0]
+    step = manifest["shield"]["limits"]["step_near_person"]
+    assert step["deepest_m"] == pytest.approx(float(limits["touch_depth"][0]))
+    assert step["beside_target"]["from_m"] == pytest.approx(float(limits["touch_place"][1]))
     assert np.shape(step["tool_motion_m"]) == (8, 8, 3)
     assert len(step["axes_of_tool_motion"]) == 3
     assert "active in 50.0% of the control steps" in card

@@ -148,8 +148,9 @@ def _promise(manifest: Mapping[str, Any]) -> str:
 
 
 _NO_BLOWS = (
-    " Near the person a step that is foreseen to strike the skin harder than the reference policy usually touches it"
-    " loses what of it leads there; not every blow is foreseen."
+    " Near the person a step that is foreseen to strike the skin harder than the reference policy usually touches it,"
+    " or beside the target to come nearer to it sooner than the reference policy does, loses what of it leads there;"
+    " not every blow is foreseen."
 )
 
 
@@ -160,9 +161,10 @@ def _shield(manifest: Mapping[str, Any]) -> str:
         return ""
     active = shield["active_share"]
     measured = "" if active is None else f" On the unseen scenarios it was active in {active:.1%} of the control steps."
+    no_blows = _NO_BLOWS if "step_near_person" in shield["limits"] else ""
     return (
         "## Shield\n\nWhere observation, force, or the change of the action leave what was tested, the action returns"
-        f" smoothly to the reference policy's.{_NO_BLOWS if 'depth_of_step' in shield['limits'] else ''} How far is the"
+        f" smoothly to the reference policy's.{no_blows} How far is the"
         f" graph's output `shield`, from 0 (not at all) to 1; the limits are in the manifest.{measured}"
     )
 

@@ -147,12 +147,6 @@ def described(observation: Space, action: Space, limits: Mapping[str, Float32Arr
         size, ramp = limits["near_action"].tolist()
         found["size_of_action_near_person"] = {"within_m": NEAR_M, "from_m": NEAR_M + COMING_NEAR_M}
         found["size_of_action_near_person"] |= {"high": size, "ramp": ramp}
-    if "touch_depth" in limits:
-        found["depth_of_step"] = {
-            "within_m": touch_limit.NEAR_M,
-            "from_m": touch_limit.NEAR_M + touch_limit.COMING_NEAR_M,
-        }
-        motion, (deepest,) = limits["touch_motion"].tolist(), limits["touch_depth"].tolist()
-        axes = ["joint angles in rad, and 1", "numbers of the action, and 1", "x, y, z"]
-        found["depth_of_step"] |= {"deepest_m": deepest, "tool_motion_m": motion, "axes_of_tool_motion": axes}
+    if NAMES[0] in limits:
+        found["step_near_person"] = touch_limit.described(limits)
     return found

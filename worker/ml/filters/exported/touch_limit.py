@@ -1,7 +1,7 @@
 """How a step may reach the skin: no deeper than the reference policy's touches, and beside the target hardly sooner.
 
     depth = -outward . (tool - target + motion),    motion = a J(q) + b(q)   m, where the step would end by itself
-    closer = -outward . (a - mean) J(q)             m, that it leads nearer to the skin than the reference policy's would
+    closer = -outward . (a - mean) J(q)             m, that it leads nearer to the skin than the reference policy's
     excess = max(depth - deepest, beside (closer - CLOSING height)),    height = outward . (tool - target) - skin
     action' = action + near excess g / |g|^2,       g = J(q) outward         where excess > 0, else as it is
 
@@ -13,6 +13,7 @@ more than the whole action's size, whatever is foretold for postures never seen.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ NO_LIMIT_M = 1e6
 
 
 class TouchLimit(nn.Module):
-    """observation (B, D), mean (B, A), action (B, A) -> action (B, A), the share that was taken back (B, 1) in [0, 1]."""
+    """observation (B, D), mean (B, A), action (B, A) -> action (B, A), the share of it that was taken back (B, 1)."""
 
     touch_motion: Tensor
     touch_depth: Tensor
@@ -133,3 +134,17 @@ def touch_limits(space: Space, reference: Sequence[Trajectory]) -> dict[str, Flo
     learned_motion = learned.reshape(shape)
     limits = zip(NAMES, (learned_motion, [deepest], place), strict=True)
     return {name: np.array(limit, np.float32) for name, limit in limits}
+
+
+def described(limits: Mapping[str, Float32Array]) -> dict[str, Any]:
+    """These limits as a bundle's manifest has them."""
+    (deepest,) = limits["touch_depth"].tolist()
+    said: dict[str, Any] = {"within_m": NEAR_M, "from_m": NEAR_M + COMING_NEAR_M}
+    said |= {} if deepest == NO_LIMIT_M else {"deepest_m": deepest}
+    said |= {"tool_motion_m": limits["touch_motion"].tolist()}
+    said |= {"axes_of_tool_motion": ["joint angles in rad, and 1", "numbers of the action, and 1", "x, y, z"]}
+    if "touch_place" in limits:
+        skin, at_target = limits["touch_place"].tolist()
+        beside = {"from_m": at_target, "beyond_m": at_target + BESIDE_M, "skin_m": skin}
+        said["beside_target"] = beside | {"nearer_than_reference_by_share_of_height": CLOSING}
+    return said
