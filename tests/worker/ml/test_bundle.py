@@ -272,6 +272,7 @@ def test_a_shield_is_told_in_manifest_card_and_script(contents: BundleContents, 
     assert np.shape(step["tool_motion_m"]) == (8, 8, 3)
     assert len(step["axes_of_tool_motion"]) == 3
     assert "active in 50.0% of the control steps" in card
+    assert "foreseen to strike the skin harder than the reference policy usually touches it or come much nearer" in card
     assert "not every blow is foreseen" in card
     assert sentence in card
     assert run(tmp_path).returncode == 0

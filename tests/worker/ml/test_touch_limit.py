@@ -23,6 +23,7 @@ from worker.ml.filters.exported.touch_limit import (
     TOUCH_N,
     USUAL,
     TouchLimit,
+    described,
     touch_limits,
 )
 
@@ -205,3 +206,10 @@ def test_nobody_waits_for_a_graph_with_or_without_this_limit() -> None:
     for shield in (limits, {name: limit for name, limit in limits.items() if name not in NAMES}):
         act_of(family, policy, FilterWeights(mode=family.named([0.5, 0.0, 0.0, 0.0, 0.1]), shield=shield))
     assert len(filter_onnx._templates) == known
+
+
+def test_a_manifest_names_only_the_limits_that_there_are() -> None:
+    assert described(LIMITS)["deepest_m"] == pytest.approx(float(LIMITS["touch_depth"][0]))
+    assert "deepest_m" not in described(NO_DEPTH), "Drinking"
+    before = {name: limit for name, limit in LIMITS.items() if name != "touch_place"}
+    assert "beside_target" not in described(before), "filters of before"

@@ -147,11 +147,11 @@ def _promise(manifest: Mapping[str, Any]) -> str:
     return f"## Promise about harm\n\n{said} Scenarios are those of the simulation, not of a real room."
 
 
-_NO_BLOWS = (
-    " Near the person a step that is foreseen to strike the skin harder than the reference policy usually touches it,"
-    " or beside the target to come nearer to it sooner than the reference policy does, loses what of it leads there;"
-    " not every blow is foreseen."
-)
+_STEPS_NEAR_PERSON = {
+    "deepest_m": "strike the skin harder than the reference policy usually touches it",
+    "beside_target": "come much nearer to the skin beside the target than the reference policy's would",
+}
+"""What a step is kept from, by the limit in the manifest."""
 
 
 def _shield(manifest: Mapping[str, Any]) -> str:
@@ -161,7 +161,13 @@ def _shield(manifest: Mapping[str, Any]) -> str:
         return ""
     active = shield["active_share"]
     measured = "" if active is None else f" On the unseen scenarios it was active in {active:.1%} of the control steps."
-    no_blows = _NO_BLOWS if "step_near_person" in shield["limits"] else ""
+    limits = shield["limits"].get("step_near_person", {})
+    kept_from = " or ".join(said for name, said in _STEPS_NEAR_PERSON.items() if name in limits)
+    no_blows = (
+        f" Near the person a step that is foreseen to {kept_from} loses what of it leads there; not every blow is foreseen."
+        if kept_from
+        else ""
+    )
     return (
         "## Shield\n\nWhere observation, force, or the change of the action leave what was tested, the action returns"
         f" smoothly to the reference policy's.{no_blows} How far is the"
