@@ -152,6 +152,7 @@ _STEPS_NEAR_PERSON = {
     "beside_target": "come much nearer to the skin beside the target than the reference policy's would",
 }
 """What a step is kept from, by the limit in the manifest."""
+_NO_BLOWS = "Near the person a step that is foreseen to {} loses what of it leads there; not every blow is foreseen."
 
 
 def _shield(manifest: Mapping[str, Any]) -> str:
@@ -163,11 +164,7 @@ def _shield(manifest: Mapping[str, Any]) -> str:
     measured = "" if active is None else f" On the unseen scenarios it was active in {active:.1%} of the control steps."
     limits = shield["limits"].get("step_near_person", {})
     kept_from = " or ".join(said for name, said in _STEPS_NEAR_PERSON.items() if name in limits)
-    no_blows = (
-        f" Near the person a step that is foreseen to {kept_from} loses what of it leads there; not every blow is foreseen."
-        if kept_from
-        else ""
-    )
+    no_blows = f" {_NO_BLOWS.format(kept_from)}" if kept_from else ""
     return (
         "## Shield\n\nWhere observation, force, or the change of the action leave what was tested, the action returns"
         f" smoothly to the reference policy's.{no_blows} How far is the"
