@@ -11,7 +11,7 @@ import httpx2
 
 from app.settings import Settings
 from tests import databases
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 _LOOK_AGAIN_S = 0.3
 
@@ -25,7 +25,16 @@ class Server:
         self.start()
 
     def start(self) -> None:
+        """Returns when it answers."""
         self.process = subprocess.Popen([sys.executable, "-m", "app", "web"], env=self._environment)
+        assert until(lambda: self.process.poll() is not None or self._answers()), "the server never answered"
+        assert self.process.poll() is None, "the server has ended; what it said is above"
+
+    def _answers(self) -> bool:
+        try:
+            return httpx2.get(f"{self.address}/health", timeout=PATIENCE_S).is_success
+        except httpx2.TransportError:
+            return False
 
     def kill(self) -> None:
         self.process.kill()
@@ -64,14 +73,16 @@ class Labeller(threading.Thread):
                 self.everybody.release()
 
     def _persist(self, client: httpx2.Client, method: str, path: str, fields: dict[str, str]) -> httpx2.Response:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline, last = time.monotonic() + PATIENCE_S, ""
         while time.monotonic() < deadline:
             try:
                 response = client.request(method, path, data=fields or None)
-            except httpx2.TransportError:
+            except httpx2.TransportError as error:
+                last = repr(error)
                 threading.Event().wait(0.2)
                 continue
             if response.status_code < 400:
                 return response
+            last = f"{response.status_code} {response.text}"
             threading.Event().wait(0.05)
-        raise AssertionError(f"{method} {path} was never accepted")
+        raise AssertionError(f"{method} {path} was never accepted, at last: {last}")

@@ -15,9 +15,9 @@ FIXED_PORTS = range(20_000, 32_000)
 
 
 def free_port() -> int:
-    """A port at which nobody listens."""
+    """A port at which nobody listens, drawn by the system: tests beside this one may have seeded ``random`` alike."""
     while True:
-        port = random.choice(FIXED_PORTS)  # noqa: S311
+        port = random.SystemRandom().choice(FIXED_PORTS)
         with socket.socket() as probe, suppress(OSError):
             probe.bind(("127.0.0.1", port))
             return port
