@@ -18,10 +18,10 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
-from worker.ml.filters.fitting.gate import try_on
+from worker.ml.filters.fitting.gate import trial_of, try_on
 from worker.ml.filters.fitting.residual import learn_round
 from worker.ml.filters.fitting.response_surface import ResponseSurface
-from worker.ml.rewards.reward_models import StructuredReward
+from worker.ml.rewards.reward_models import UNDONE, StructuredReward
 
 POLICY = invented.small_policy()
 FAMILY = invented.TASK.modes
@@ -213,6 +213,35 @@ def test_a_residual_is_learned_for_more_of_what_is_liked_though_no_clip_has_show
     learned, limited = (residual.train_residual(each, quick, World().collect) for each in (asked, shown))
     assert speed_of(learned) > 1.1 * speed_of(quick)
     assert limited.weights.to_bytes() == learned.weights.to_bytes(), "by weights, whatever clips have shown"
+
+
+def _driven_with_failures(act: Act, failed: Sequence[int], scenarios: range) -> list[Trajectory]:
+    """An undone task earns nothing, so each of these scenarios costs what is earned in many others."""
+    driven = World().collect(act, scenarios, 0.0, 0)
+    for place in failed:
+        signals = driven[place].signals.copy()
+        signals[-1, SIGNALS.index(UNDONE)] = 1.0
+        driven[place] = replace(driven[place], signals=signals, success=False)
+    return driven
+
+
+def test_two_failures_in_eighty_scenarios_do_not_hide_what_is_better_in_all_others_but_many_do() -> None:
+    """Of the mode and a little more of it, for somebody who likes speed."""
+    scenarios = first_of(GATE, 80)
+    reference = World().collect(POLICY.mean, scenarios, 0.0, 0)
+    asked = problem(1.0, reference)
+    asked = replace(asked, reward=replace(asked.reward, undone_column=SIGNALS.index(UNDONE)))
+    quick, quicker = (act_of(FAMILY, POLICY, FilterWeights(mode={"speed_far": fast})) for fast in (0.3, 0.305))
+
+    def preference(act: Act, failed: Sequence[int]) -> float:
+        driven = _driven_with_failures(act, failed, scenarios)
+        return trial_of(asked, 1.0, 0.0, reference, driven).preference
+
+    mode = preference(quick, ())
+    assert preference(quicker, ()) > mode
+    assert preference(quicker, (5, 60)) > mode
+    assert preference(quicker, range(0, 80, 4)) < mode
+    assert preference(quick, (5, 60)) < mode
 
 
 def test_a_residual_that_does_not_help_is_left_out_and_said_so(reference: list[Trajectory]) -> None:

@@ -23,7 +23,7 @@ class GateTrial:
     residual_share: float
     preference: float
     """mean change of the learned return, not limited (RewardModel.member_returns), in standard deviations of the
-    reference's returns"""
+    reference's returns; failures count for less than they cost there, see gate.trial_of()"""
     success_change: float
     """share of episodes"""
     p95_force_n: float

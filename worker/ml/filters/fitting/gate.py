@@ -10,6 +10,9 @@ from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 
+PRIOR = 4.0
+"""scenarios in which only one of two policies fails, two of them either, that are imagined before any was driven"""
+
 
 def try_on(
     problem: FilterProblem,
@@ -34,11 +37,25 @@ def trial_of(
 ) -> GateTrial:
     """What rollouts say, beside the reference policy's of the same scenarios."""
     before, after = (problem.reward.member_returns(driven) for driven in (reference, filtered))
-    gains = (after - before).mean(axis=1)
+    outcomes = successes(filtered) - successes(reference)
+    gains = np.average(after - before, axis=1, weights=_weights(outcomes))
     unit = max(float(before.mean(axis=0).std()), 1e-9)
-    success = float((successes(filtered) - successes(reference)).mean())
+    success = float(outcomes.mean())
     force = _p95_force_n(filtered)
     return GateTrial(gate, residual_share, float(gains.mean()) / unit, success, force, chance=chance_of_gain(gains))
+
+
+def _weights(outcomes: FloatArray) -> FloatArray:
+    """(N,) changes of success, each -1, 0 or 1 -> what each scenario counts for in the change of the return, (N,).
+
+    An undone task earns nothing, so that one failure in 80 scenarios, which is mostly chance, costs more than a residual
+    earns in the other 79. The n scenarios in which only one of two policies fails count n / (n + PRIOR), for before any
+    was driven either was as likely to be that one, Beta(PRIOR / 2, PRIOR / 2). How much success may be lost is another
+    question: see keeps_task().
+    """
+    changed = outcomes != 0.0
+    n = changed.sum()
+    return np.where(changed, n / (n + PRIOR), 1.0)
 
 
 def chance_of_gain(gains: FloatArray) -> float:
