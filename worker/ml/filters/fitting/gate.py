@@ -49,9 +49,9 @@ def _weights(outcomes: FloatArray) -> FloatArray:
     """(N,) changes of success, each -1, 0 or 1 -> what each scenario counts for in the change of the return, (N,).
 
     An undone task earns nothing, so that one failure in 80 scenarios, which is mostly chance, costs what a residual
-    earns in twenty of the others. The n scenarios in which only one of two policies fails count n / (n + PRIOR), for before any
-    was driven either was as likely to be that one, Beta(PRIOR / 2, PRIOR / 2). How much success may be lost is another
-    question: see keeps_task().
+    earns in twenty of the others. The n scenarios in which only one of two policies fails count n / (n + PRIOR), for
+    before any was driven either was as likely to be that one, Beta(PRIOR / 2, PRIOR / 2). How much success may be lost
+    is another question: see keeps_task().
     """
     changed = outcomes != 0.0
     n = changed.sum()
