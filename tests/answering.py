@@ -32,7 +32,7 @@ class Server:
 
     def _answers(self) -> bool:
         try:
-            return httpx2.get(f"{self.address}/health", timeout=PATIENCE_S).is_success
+            return httpx2.get(f"{self.address}/health/live", timeout=PATIENCE_S).is_success
         except httpx2.TransportError:
             return False
 

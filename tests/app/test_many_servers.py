@@ -24,7 +24,7 @@ from app.web.http.new_links import NewLink
 from app.web.http.rate_limit import SharedAttempts
 from tests import databases, factories
 from tests.answering import Server
-from tests.waiting import PATIENCE_S, free_port, until
+from tests.waiting import PATIENCE_S, free_port
 
 SERVERS, PEOPLE, LABELS, JOINING = 2, 6, 12, 20
 SCRIPT = {"Accept": "application/json"}
@@ -35,17 +35,9 @@ SEVERAL = pytest.mark.skipif(databases.SERVER is None, reason="with SQLite there
 def addresses(settings: Settings, database: Database) -> Iterator[list[str]]:
     """Of servers in processes of their own."""
     servers = [Server(settings.model_copy(update={"port": free_port()})) for _ in range(SERVERS)]
-    assert until(lambda: all(map(_is_up, servers)))
     yield [server.address for server in servers]
     for server in servers:
         server.kill()
-
-
-def _is_up(server: Server) -> bool:
-    try:
-        return httpx2.get(f"{server.address}/health/live", timeout=PATIENCE_S).is_success
-    except httpx2.TransportError:
-        return False
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from tests import databases, factories
 from tests.answering import Server
 from tests.app.conftest import TakingPart
 from tests.databases import make_tables
-from tests.waiting import PATIENCE_S, free_port, until
+from tests.waiting import PATIENCE_S, free_port
 
 pytestmark = pytest.mark.sqlite("about a disk on which SQLite's file lies")
 JSON = {"Accept": "application/json"}
@@ -62,17 +62,9 @@ def browser_of(settings: Settings) -> Iterator[httpx2.Client]:
     server = Server(settings)
     try:
         with httpx2.Client(base_url=server.address, headers=JSON, timeout=PATIENCE_S) as browser:
-            assert until(lambda: answers(browser))
             yield browser
     finally:
         server.kill()
-
-
-def answers(browser: httpx2.Client) -> bool:
-    try:
-        return browser.get("/health/live").is_success
-    except httpx2.TransportError:
-        return False
 
 
 def fill(disk: Path) -> Path:
