@@ -14,7 +14,7 @@ from app.installed_tasks import lab
 from app.installed_tasks.lab import LabDescription
 from app.services.studies import task_limits
 from tests.lab.test_check import change, found, said
-from tests.lab.test_serve_filter import MODE, ended, served, written
+from tests.lab.test_serve_filter import MODE, PATIENT, ended, served, written
 from worker.compute import simulation
 from worker.compute.lab_policies import policy_of
 from worker.experiments import fit_response_surface
@@ -165,7 +165,7 @@ def test_a_bundle_calls_the_function_it_belongs_to_and_no_other(called: Path, tm
     (folder / "to_goal.py").write_text(TO_GOAL.replace("4.0", "3.25"))
     assert "this is another policy than the one of this bundle" in ended(folder, *loop)
     (folder / "to_goal.py").write_text(TO_GOAL)
-    with served(folder, "--upstream", "to_goal:act", "--deadline-ms", "5000") as (url, process):
+    with served(folder, "--upstream", "to_goal:act", *PATIENT) as (url, process):
         client = PolicyServer(url)
         actions = [client.ask({"observation": seen[:4]})["actions"][0] for seen in trajectory.observations[:-1]]
         np.testing.assert_allclose(actions, 0.1 * trajectory.actions, atol=1e-6)

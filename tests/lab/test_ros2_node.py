@@ -93,7 +93,7 @@ def test_a_robot_behind_the_node_moves_as_it_did_when_the_filter_was_fitted_and_
 ) -> None:
     episode = made.environment.episode(made.filter, 3, made.policy.mean)
     folder = written(made.task, made.policy, episode, made.filter, tmp_path / "bundle")
-    between, topics = example.Between(folder, made.url, deadline_s=5.0, stale_s=5.0), Topics()
+    between, topics = example.Between(folder, made.url, deadline_s=60.0, stale_s=60.0), Topics()
     stop = example.wire(topics, between, MESSAGES)
     assert topics.period_s == pytest.approx(0.1)
     topics.step()
@@ -110,7 +110,7 @@ def test_a_robot_behind_the_node_moves_as_it_did_when_the_filter_was_fitted_and_
     topics.step()
     assert topics.newest()[0] == [0.0, 0.0]
     assert topics.newest()[1].startswith("stale: the newest observation is")
-    between._stale_s = 5.0
+    between._stale_s = 60.0
 
     topics.observe([0.0, np.nan, 0.0, 0.0])
     topics.step()

@@ -10,6 +10,7 @@ import urllib.request
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from worker.compute.lab_policies import policy_of
 from worker.domain.task import Task
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.experiments.lab_ranges import first_found
-from worker.ml.export import bundle
+from worker.ml.export import bundle, filter_loop
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.export.filter_loop import FilterLoop, Refused, Run, require_same
 from worker.ml.export.interface import interface_of
@@ -38,6 +39,8 @@ from worker.ml.rewards.reward_models import StructuredReward
 from worker.sim.lab.environment import LabEnvironment
 
 MODE = {"speed_far": -0.7, "smooth": 0.4, "push_y": 0.3}
+PATIENT = ("--deadline-ms", "60000", "--pause-s", "0")
+"""How a filter is served where the machine may be busy with other tests: nothing is late, nobody too silent."""
 SEEN = {"observation": np.array([0.1, 0.2, 0.8, -0.6], np.float32)}
 
 
@@ -189,6 +192,25 @@ def test_a_client_that_was_silent_goes_on_from_standstill_with_a_new_chunk(plane
         loop.close()
 
 
+def test_a_client_that_waits_for_a_slow_policy_is_not_silent(
+    plane_of: Callable[..., Plane], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, clock = list[int](), [0.0]
+
+    def answer(message: dict[str, Any]) -> dict[str, Any]:
+        asked.append(1)
+        clock[0] += 2.0
+        return to_goal(message)
+
+    made = plane_of(answer)
+    monkeypatch.setattr(filter_loop, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    loop = made.loop(pause_s=1.0)
+    for _ in range(4):
+        loop.answer(packed(SEEN))
+    assert (len(asked), loop.counted.pauses) == (1, 0), "the actions of its chunk are used, however long it took"
+    loop.close()
+
+
 @pytest.mark.parametrize(
     ("message", "sentence"),
     [
@@ -333,7 +355,7 @@ def test_a_bundle_stands_between_a_policy_server_and_a_client(plane_of: Callable
     folder = written(made.task, made.policy, trajectory, made.filter, tmp_path / "bundle")
     assert not (folder / "policy.onnx").exists()
     assert "--upstream ws://HOST:PORT" in (folder / "MODEL_CARD.md").read_text()
-    with served(folder, "--upstream", made.url, "--deadline-ms", "5000") as (url, process):
+    with served(folder, "--upstream", made.url, *PATIENT) as (url, process):
         client, second = PolicyServer(url), PolicyServer(url)
         client.connect()
         assert client.metadata["interface"]["task"] == "plane"

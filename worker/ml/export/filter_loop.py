@@ -8,8 +8,8 @@ shield was. The first message of a connection begins an episode, and so does one
 The watchdog: an answer later than the deadline gives the last action at half, a quarter, an eighth of it ("slow"), then
 zero ("stop"), until the policy is in time again; actions that do not move the robot, a gripper's, stay as they were. A
 policy server that hangs up, reports an error, or says what is no action: "stop" at once. A client that is silent for
-longer than the pause is taken to have stopped: it goes on from standstill with a new chunk. The robot's own watchdog
-must stop it when this loop says nothing at all.
+longer than the pause after an answer is taken to have stopped: it goes on from standstill with a new chunk. The robot's
+own watchdog must stop it when this loop says nothing at all.
 """
 
 import contextlib
@@ -117,7 +117,8 @@ class FilterLoop:
         self.counted = Counted()
         self._activities = deque[float](maxlen=interface["episode_steps"])
         self._step, self._late = 0, 0
-        self._last_s: float | None = None
+        self._asked_s: float | None = None  # the client, last
+        self._answered_s = 0.0
         self._previous: Any = None
         self._chunk: Any = None
         self._begin()
@@ -160,7 +161,8 @@ class FilterLoop:
         self._previous, self._step = action, self._step + 1
         self.counted.steps += 1
         self.counted.states[state] = self.counted.states.get(state, 0) + 1
-        self.counted.whole_ms.append(1000 * (time.perf_counter() - now))
+        self._answered_s = time.perf_counter()
+        self.counted.whole_ms.append(1000 * (self._answered_s - now))
         said = {"state": state, "why": why or self._notes(), "shield": shield}
         return {**others, "actions": self._outside(action)[None], "filter": said}
 
@@ -178,7 +180,7 @@ class FilterLoop:
 
     def _begin(self) -> None:
         """An episode: from standstill, with nothing of the one before."""
-        self._step, self._late, self._last_s = 0, 0, None
+        self._step, self._late, self._asked_s = 0, 0, None
         self._previous = np.zeros(len(self._low), np.float32)
         self._chunk = np.empty((0, len(self._low)), np.float32)
 
@@ -189,14 +191,14 @@ class FilterLoop:
     def _look_at_the_clock(self, now: float, reset: bool) -> None:
         if reset:
             self._begin()
-        elif self._last_s is not None:
-            silent = now - self._last_s
-            if self._pause_s and silent > self._pause_s:
+        elif self._asked_s is not None:
+            # from the answer on: while a slow policy is asked, the client waits and is not silent
+            if self._pause_s and now - self._answered_s > self._pause_s:
                 self.counted.pauses += 1
                 self._stand_still()
             else:
-                self.counted.intervals_s.append(silent)
-        self._last_s = now
+                self.counted.intervals_s.append(now - self._asked_s)
+        self._asked_s = now
 
     def _observation(self, message: Mapping[str, Any]) -> Any:
         """(own size,) from the fields by their names, the whole as "observation", or what the policy is sent."""
