@@ -58,7 +58,7 @@ class Between:
             deadline_s or self.step_s,
             self._stale_s,
         )
-        self._loop.usual_strong_share = (manifest.get("shield") or {}).get("strong_share_at_most")
+        self._loop.compare_with_tests(manifest, bundle)
         self._loop.begin_connection()
         self._moving = np.isin(np.arange(len(self.interface["action"]["names"])), self.interface["action"]["moving"])
         self._observation: Any = None

@@ -8,6 +8,7 @@ import sys
 import threading
 import urllib.request
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,13 +22,16 @@ from app.installed_tasks.lab import LabDescription
 from tests.lab.policy_server import Answer, serving, to_goal
 from tests.lab.test_check import change
 from tests.worker import invented
+from worker.compute import filter_finishing
 from worker.compute.lab_policies import policy_of
 from worker.domain.task import Task
 from worker.domain.trajectory import SIGNALS, Trajectory
+from worker.domain.type_aliases import Float32Array
 from worker.experiments.lab_ranges import first_found
 from worker.ml.export import bundle, filter_loop
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
 from worker.ml.export.filter_loop import FilterLoop, Refused, Run, require_same
+from worker.ml.export.forward_model import ForwardModel
 from worker.ml.export.interface import interface_of
 from worker.ml.filters.exported import shield
 from worker.ml.filters.exported.filter_act import FilterAct, act_of
@@ -292,6 +296,41 @@ def test_a_shield_that_acts_more_than_in_tests_is_told_once_an_episode_has_been_
     assert f"the shield active in {2 * len(said)}" in str(loop.counted)
     loop.begin_connection()
     assert not any(tells(each) for each in episode(1.5)[:-1])
+    loop.close()
+
+
+def forward_model(made: Plane) -> ForwardModel:
+    """Of its usual episodes, as the studio learns it of an evaluation's."""
+    driven = [made.environment.episode(made.filter, scenario, made.policy.mean) for scenario in range(12)]
+    found = filter_finishing._forward_model(made.task, driven)
+    assert found is not None
+    return found
+
+
+def test_a_robot_whose_actions_come_late_is_told_before_its_episode_ends(
+    plane_of: Callable[..., Plane], tmp_path: Path
+) -> None:
+    made = plane_of()
+    (tmp_path / "forward_model.npz").write_bytes(forward_model(made).to_bytes())
+    loop = made.loop()
+    loop.compare_with_tests({}, tmp_path)
+
+    def episode(late: int) -> list[bool]:
+        """Whether it is told, step by step."""
+        on_the_way, told = deque([np.zeros(2, np.float32)] * late), list[bool]()
+
+        def act(seen: Float32Array) -> Float32Array:
+            answer = loop.answer(packed({"observation": seen[:4]} | ({} if told else {"reset": True})))
+            told.append("otherwise than in its tests" in answer["filter"]["why"])
+            on_the_way.append(np.asarray(answer["actions"][0], np.float32) / 0.1)
+            return on_the_way.popleft()
+
+        made.environment.episode(act, 50)
+        return told
+
+    assert not any(episode(late=0))
+    assert episode(late=2).index(True) < 20
+    assert not any(episode(late=0)), "an episode begins anew"
     loop.close()
 
 

@@ -17,6 +17,8 @@ from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, Provenance, RecordedSteps
+from worker.ml.export.forward_model import ForwardModel
+from worker.ml.export.interface import own_observation
 from worker.ml.export.run_filter import strong_share
 from worker.ml.filters.exported.filter_act import FilterAct
 from worker.ml.filters.exported.filter_module import FilterWeights
@@ -103,6 +105,7 @@ def finish(fit: FilterFit, draft: FilterDraft, provenance: Provenance, learned: 
         recording=_recording(fit, proven),
         metrics=metrics,
         provenance=provenance,
+        forward_model=_forward_model(task, proven.driven),
     )
     return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
 
@@ -179,6 +182,13 @@ def _shield_activity(proven: Proven) -> dict[str, float]:
 def usually_at_most(shares: Sequence[float]) -> float:
     """What 99 of 100 episodes do not exceed; with fewer of them the largest."""
     return float(np.quantile(shares, 0.99, method="higher"))
+
+
+def _forward_model(task: Task, driven: Sequence[Trajectory]) -> ForwardModel | None:
+    """Of what clients see: what a loop adds to a laboratory's observations is not measured."""
+    seen = own_observation(task)
+    widths = np.concatenate([np.full(field.size, field.high - field.low) for field in seen.fields])
+    return ForwardModel.learned([(each.observations[:, : seen.size], each.actions) for each in driven], widths)
 
 
 def _strengths(weights: FilterWeights) -> dict[str, float]:

@@ -23,6 +23,7 @@ from worker.analysis.filters.evaluation import evaluate
 from worker.domain.trajectory import SIGNALS
 from worker.ml.export import bundle
 from worker.ml.export.bundle import BundleContents, BundleDamaged, Provenance, RecordedSteps
+from worker.ml.export.forward_model import ForwardModel
 from worker.ml.export.model_card import model_card
 from worker.ml.filters.exported import shield
 from worker.ml.filters.exported.filter_module import FilterWeights, build
@@ -63,6 +64,7 @@ def contents() -> BundleContents:
             "costs": {"weights": {"C_d": {"mean": -0.7, "low": -0.8, "high": -0.6}}, "explained": 0.9},
         },
         provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z", "cd" * 32, "none"),
+        forward_model=ForwardModel(np.zeros((invented.D + 8, invented.D)), np.ones(invented.D), 1.0),
     )
 
 
@@ -97,6 +99,8 @@ def test_everything_promised_is_inside_and_nothing_else(written: bytes) -> None:
                 "action_encoder.safetensors",
                 "filter.onnx",
                 "filter_loop.py",
+                "forward_model.npz",
+                "forward_model.py",
                 "manifest.json",
                 "policy.onnx",
                 "policy_client.py",
@@ -191,7 +195,7 @@ def test_the_card_of_a_laboratorys_filter_says_nothing_of_our_robot_and_person(u
 def test_the_bundle_runs_on_its_own_and_confirms_itself(unzipped: Path) -> None:
     finished = run(unzipped)
     assert finished.returncode == 0, finished.stderr
-    assert "12 files match" in finished.stdout
+    assert "14 files match" in finished.stdout
     assert "OK: policy and filter reproduce their recorded actions" in finished.stdout
 
 
@@ -429,7 +433,7 @@ class TestSignature:
         without = [sys.executable, "-I", "-c", code]
         finished = subprocess.run(without, cwd=directory, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stderr
-        assert "12 files match" in finished.stdout
+        assert "14 files match" in finished.stdout
         assert "Signature: not checked" in finished.stdout
         insisting = [*without, "--key", key.fingerprint]
         assert subprocess.run(insisting, cwd=directory, capture_output=True, check=False).returncode == 1

@@ -21,7 +21,8 @@ from worker.domain.spaces import Space
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
-from worker.ml.export import filter_loop, run_filter, serve_filter
+from worker.ml.export import filter_loop, forward_model, run_filter, serve_filter
+from worker.ml.export.forward_model import ForwardModel
 from worker.ml.export.interface import interface_of
 from worker.ml.export.model_card import model_card
 from worker.ml.filters.exported import shield
@@ -38,7 +39,7 @@ MANIFEST, SIGNATURE = "manifest.json", "signature.json"
 LARGEST_BYTES = 256 << 20
 """Of all files of a bundle together; those written so far have a hundredth of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)
-_SCRIPTS = (run_filter, serve_filter, filter_loop, policy_client)
+_SCRIPTS = (run_filter, serve_filter, filter_loop, forward_model, policy_client)
 _LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "safetensors", "torch")
 
 
@@ -94,6 +95,8 @@ class BundleContents:
     metrics: Mapping[str, Any]
     """Model.metrics of the filter; evaluation, notes and the reward model's weights are published"""
     provenance: Provenance
+    forward_model: ForwardModel | None = None
+    """of the evaluation's episodes"""
 
 
 def write(contents: BundleContents) -> bytes:
@@ -105,6 +108,7 @@ def write(contents: BundleContents) -> bytes:
         **_policy_files(contents.policy),
         "reward_model.safetensors": contents.reward.to_bytes(),
         "action_encoder.safetensors": contents.weights.to_bytes(),
+        **({forward_model.FILE: contents.forward_model.to_bytes()} if contents.forward_model else {}),
         **{Path(str(each.__file__)).name: Path(str(each.__file__)).read_bytes() for each in _SCRIPTS},
         "recorded/observations.npy": _npy(recording.observations),
         "recorded/policy_means.npy": _npy(recording.policy_means),

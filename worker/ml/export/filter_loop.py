@@ -2,8 +2,9 @@
 
 A client's message goes to the policy server as it came; a policy that is a function is called in this process instead.
 Of the chunk that comes back, the actions are filtered one at a time, each with a fresh observation, and the client gets
-one action (1, A) in the policy's own units, with ``filter``: in which state the loop is and why, and how active the
-shield was. The first message of a connection begins an episode, and so does one that says ``"reset": true``.
+one action (1, A) in the policy's own units, with ``filter``: in which state the loop is and why, how active the shield
+was, and what is other than in the filter's tests. The first message of a connection begins an episode, and so does one
+that says ``"reset": true``.
 
 The watchdog: an answer later than the deadline gives the last action at half, a quarter, an eighth of it ("slow"), then
 zero ("stop"), until the policy is in time again; actions that do not move the robot, a gripper's, stay as they were. A
@@ -19,12 +20,15 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as Late
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 if __package__:
-    from worker.ml.export.run_filter import strong_share, unusual_activity
+    from worker.ml.export import forward_model
+    from worker.ml.export.forward_model import DynamicsMonitor, ForwardModel
+    from worker.ml.export.run_filter import strong_share, unusual_activity, usual_strong_share
     from worker.ml.policies.policy_client import (
         PolicyFunction,
         PolicyServer,
@@ -33,7 +37,9 @@ if __package__:
         packed,
         unpacked,
     )
-else:  # in a bundle it lies beside this file
+else:  # in a bundle they lie beside this file
+    import forward_model  # type: ignore[import-not-found, no-redef]  # in bundles
+    from forward_model import DynamicsMonitor, ForwardModel  # type: ignore[no-redef]  # in bundles
     from policy_client import (  # type: ignore[import-not-found, no-redef]  # in bundles
         PolicyFunction,
         PolicyServer,
@@ -42,7 +48,11 @@ else:  # in a bundle it lies beside this file
         packed,
         unpacked,
     )
-    from run_filter import strong_share, unusual_activity  # type: ignore[import-not-found, no-redef]  # in bundles
+    from run_filter import (  # type: ignore[import-not-found, no-redef]  # in bundles
+        strong_share,
+        unusual_activity,
+        usual_strong_share,
+    )
 
 Run = Callable[[Any, Any], Sequence[Any]]
 """(N, D), (N, A) -> (N, A), (N, 1): the filter, in the studio's units, and the activity of its shield"""
@@ -98,6 +108,8 @@ class FilterLoop:
 
     usual_strong_share: float | None = None
     """of an episode's steps, in which its shield was strongly active in tests, at most; None: not known"""
+    monitor: DynamicsMonitor | None = None
+    """None: what followed from actions in tests is not known"""
 
     def __init__(
         self,
@@ -119,9 +131,18 @@ class FilterLoop:
         self._step, self._late = 0, 0
         self._asked_s: float | None = None  # the client, last
         self._answered_s = 0.0
+        self._seen: Any = None  # before the last action, while nothing else has moved the robot since
         self._previous: Any = None
         self._chunk: Any = None
         self._begin()
+
+    def compare_with_tests(self, manifest: Mapping[str, Any], bundle: Path) -> None:
+        """Tell when the world is another than in the tests of this bundle; those of earlier versions know less."""
+        self.usual_strong_share = usual_strong_share(manifest)
+        if (stored := bundle / forward_model.FILE).exists():
+            names = [each["name"] for each in self.interface["observation"] for _ in range(each["size"])]
+            model = ForwardModel.from_bytes(stored.read_bytes())
+            self.monitor = DynamicsMonitor(model, names, self.interface["episode_steps"])
 
     def begin_connection(self) -> None:
         """Somebody else is there."""
@@ -137,6 +158,8 @@ class FilterLoop:
             require_same("the client", message["interface"], self.interface)
         observation = self._observation(message)
         self._look_at_the_clock(now, bool(message.get("reset")))
+        if self.monitor and self._seen is not None:
+            self.monitor.step(self._seen, self._previous, observation)
         state, why, shield, others = "ok", "", 0.0, dict[str, Any]()
         try:
             mean = self._mean(observation, stored, others)
@@ -158,7 +181,7 @@ class FilterLoop:
             self._activities.append(shield)
         else:
             action = self._slower(0.5 if state == "slow" else 0.0)
-        self._previous, self._step = action, self._step + 1
+        self._seen, self._previous, self._step = observation, action, self._step + 1
         self.counted.steps += 1
         self.counted.states[state] = self.counted.states.get(state, 0) + 1
         self._answered_s = time.perf_counter()
@@ -181,12 +204,14 @@ class FilterLoop:
     def _begin(self) -> None:
         """An episode: from standstill, with nothing of the one before."""
         self._step, self._late, self._asked_s = 0, 0, None
-        self._previous = np.zeros(len(self._low), np.float32)
+        self._seen, self._previous = None, np.zeros(len(self._low), np.float32)
         self._chunk = np.empty((0, len(self._low)), np.float32)
+        if self.monitor:
+            self.monitor.begin()
 
     def _stand_still(self) -> None:
         """The robot has stopped meanwhile, and a chunk is of the past."""
-        self._previous, self._chunk = self._slower(0.0), self._chunk[:0]
+        self._seen, self._previous, self._chunk = None, self._slower(0.0), self._chunk[:0]
 
     def _look_at_the_clock(self, now: float, reset: bool) -> None:
         if reset:
@@ -278,7 +303,8 @@ class FilterLoop:
 
     def _notes(self) -> str:
         """What else is not as it was in tests."""
-        return "; ".join(filter(None, (self._rate_note(), self._shield_note())))
+        dynamics = self.monitor.note() if self.monitor else ""
+        return "; ".join(filter(None, (self._rate_note(), dynamics, self._shield_note())))
 
     def _shield_note(self) -> str:
         """Of the last as many steps as an episode has: how active a shield is differs within it."""

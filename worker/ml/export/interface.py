@@ -16,7 +16,7 @@ ROBOT_FRAME = "robot base"
 def interface_of(task: Task, policy: ReferencePolicy) -> dict[str, Any]:
     """Plain values, and a fingerprint of them."""
     lab = task.interface or _of_ours(task)
-    own = Space(task.observation.fields[:-2] if task.interface else task.observation.fields)
+    own = own_observation(task)
     found = {
         "task": task.name,
         "frame": lab.frame,
@@ -46,6 +46,11 @@ def interface_of(task: Task, policy: ReferencePolicy) -> dict[str, Any]:
     }
     written = json.dumps(found, sort_keys=True, separators=(",", ":")).encode()
     return found | {"fingerprint": hashlib.sha256(written).hexdigest()}
+
+
+def own_observation(task: Task) -> Space:
+    """What clients see, without what the loop adds to a laboratory's."""
+    return Space(task.observation.fields[:-2] if task.interface else task.observation.fields)
 
 
 def _of_ours(task: Task) -> LabInterface:

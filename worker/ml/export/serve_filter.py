@@ -23,7 +23,6 @@ from websockets.sync.server import ServerConnection, serve
 
 if __package__:
     from worker.ml.export.filter_loop import FilterLoop, Means, Refused, Run, require_same
-    from worker.ml.export.run_filter import usual_strong_share
     from worker.ml.policies.policy_client import PolicyFunction, PolicyServer, PolicyServerFailed, packed
 else:  # in a bundle they lie beside this file
     from filter_loop import (  # type: ignore[import-not-found, no-redef]  # in bundles
@@ -39,7 +38,6 @@ else:  # in a bundle they lie beside this file
         PolicyServerFailed,
         packed,
     )
-    from run_filter import usual_strong_share  # type: ignore[import-not-found, no-redef]  # in bundles
 
 SAME_WITHIN = 1e-4
 """Largest difference of a policy's action in [-1, 1] from the recorded one: another computer rounds otherwise."""
@@ -70,7 +68,7 @@ def main(manifest: Mapping[str, Any], run: Run, means: Means | None, options: ar
         return 1
     deadline_s = options.deadline_ms / 1000.0 if options.deadline_ms else 1.0 / interface["control_rate_hz"]
     loop = FilterLoop(interface, run, policy, deadline_s, options.pause_s)
-    loop.usual_strong_share = usual_strong_share(manifest)
+    loop.compare_with_tests(manifest, Path(__file__).parent)
     if isinstance(policy, PolicyFunction):
         try:
             _require_the_policy(loop, Path(__file__).with_name("recorded"))

@@ -1,0 +1,98 @@
+"""A loop tells when a robot answers to actions otherwise than in its filter's tests, and seldom when it does not."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from worker.ml.export.forward_model import FIRST_STEPS, DynamicsMonitor, ForwardModel
+
+STEPS = 40
+WIDTHS = np.array([4.0, 4.0, 4.0, 4.0, 20.0, 1.0])
+"""of position, velocity, a force that is felt now and then, and something that never changes"""
+NAMES = ["position_m", "position_m", "velocity_m_s", "velocity_m_s", "force_n", "target_m"]
+Episode = tuple[np.ndarray, np.ndarray]
+
+
+def episode(rng: np.random.Generator, late: int = 0, noise: float = 0.0, touches: float = 0.05) -> Episode:
+    """A point that is pushed about, whose friction grows with its speed: no linear model has it quite."""
+    asked = np.clip(np.cumsum(rng.normal(0.0, 0.3, (STEPS, 2)), axis=0), -1.0, 1.0)
+    done = np.vstack([np.zeros((late, 2)), asked])[:STEPS]
+    position, velocity, seen = rng.normal(0.0, 0.5, 2), np.zeros(2), []
+    for action in [*done, np.zeros(2)]:
+        force = rng.exponential(3.0) if rng.random() < touches else 0.0
+        seen.append([*position, *velocity, force, 0.4])
+        velocity = velocity + 0.1 * (action - 0.3 * velocity * np.linalg.norm(velocity))
+        position = position + 0.1 * velocity
+    observations = np.array(seen)
+    return observations + noise * WIDTHS * rng.standard_normal(observations.shape), asked
+
+
+def first_told(model: ForwardModel, some: Episode) -> int:
+    """After how many steps; 0: never."""
+    observations, actions = some
+    monitor = DynamicsMonitor(model, NAMES, STEPS)
+    for step in range(len(actions)):
+        monitor.step(observations[step], actions[step], observations[step + 1])
+        if monitor.note():
+            return step + 1
+    return 0
+
+
+@pytest.mark.parametrize("count", [40, 100])
+def test_one_in_a_hundred_usual_episodes_is_told(count: int) -> None:
+    told = []
+    for world in range(10):
+        rng = np.random.default_rng([world, count])
+        model = ForwardModel.learned([episode(rng) for _ in range(count)], WIDTHS)
+        assert model is not None
+        told += [first_told(model, episode(rng)) > 0 for _ in range(60)]
+    assert 0.001 < np.mean(told) < 2.0 / min(count, 100), "the largest of n is exceeded by one in n + 1"
+
+
+@pytest.mark.parametrize(
+    ("other", "is_told"),
+    [
+        (lambda rng: episode(rng, late=1), True),
+        (lambda rng: episode(rng, noise=0.005), True),
+        (lambda rng: episode(rng, touches=0.0), False),
+        (lambda rng: episode(rng, touches=0.2), False),
+    ],
+    ids=["late", "noise", "no touches", "many touches"],
+)
+def test_late_actions_and_noise_are_told_at_once_and_touches_are_not(
+    other: Callable[[np.random.Generator], Episode], is_told: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    model = ForwardModel.learned([episode(rng) for _ in range(100)], WIDTHS)
+    assert model is not None
+    model = ForwardModel.from_bytes(model.to_bytes())
+    told = np.array([first_told(model, other(rng)) for _ in range(50)])
+    if is_told:
+        assert (told > 0).mean() > 0.95
+        assert np.median(told) < 2 * FIRST_STEPS
+    else:
+        assert (told > 0).mean() < 0.05
+
+
+def test_what_is_furthest_off_is_named_and_a_new_episode_begins_anew() -> None:
+    rng = np.random.default_rng(0)
+    model = ForwardModel.learned([episode(rng) for _ in range(100)], WIDTHS)
+    assert model is not None
+    monitor = DynamicsMonitor(model, NAMES, STEPS)
+    observations, actions = episode(rng)
+    observations[:, 5] += rng.normal(0.0, 0.5, len(observations))
+    for step in range(FIRST_STEPS):
+        assert monitor.note() == ""
+        monitor.step(observations[step], actions[step], observations[step + 1])
+    assert "most of all target_m" in monitor.note()
+    assert "late actions" in monitor.note()
+    monitor.begin()
+    assert monitor.note() == ""
+
+
+def test_nothing_is_learned_from_too_few_steps() -> None:
+    rng = np.random.default_rng(0)
+    assert ForwardModel.learned([], WIDTHS) is None
+    assert ForwardModel.learned([episode(rng)], WIDTHS) is None
+    assert ForwardModel.learned([(seen[:4], done[:3]) for seen, done in map(episode, [rng] * 4)], WIDTHS) is None
