@@ -23,16 +23,18 @@ from app.installed_tasks import catalogue
 from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Promise, harms, outcome_of
-from worker.compute import simulation
-from worker.compute.filter_finishing import usually_at_most
-from worker.domain.scenarios import PROMISE_TEST, first_of
+from worker.compute import learning, simulation
+from worker.compute.filter_finishing import forward_model_of, usually_at_most
+from worker.domain.scenarios import EVALUATION, PROMISE_TEST, first_of
 from worker.domain.spaces import Space
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array, FloatArray
 from worker.experiments.benchmark_cell import PAPER_USERS, BenchmarkConfig, BenchmarkUser, Cell, default_method
 from worker.experiments.rollout_cache import RolloutCache
+from worker.ml.export.forward_model import DynamicsMonitor, ForwardModel
 from worker.ml.export.run_filter import strong_share, unusual_activity
 from worker.ml.filters.exported.filter_act import FilterAct
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.methods import registry as methods
 from worker.sim.assistive import AssistiveEnv
 from worker.sim.bullet import Bullet
@@ -104,12 +106,16 @@ def _measured(task: str, user: str, changes: Sequence[str], options: argparse.Na
     if not isinstance(act, FilterAct):
         raise TypeError(f"{method} is no filter.")
     scenarios = first_of(PROMISE_TEST, options.scenarios, skip=SKIP)
+    tests = learning.run_scenarios(task, act, first_of(EVALUATION, FilterConfig().evaluation_scenarios), 0.0, 0)
+    model = forward_model_of(bench.task, tests)
     for name in changes:
         env = changed_environment(task, CHANGES[name])
         policy = simulation.reference_policy(task).mean
         reference, filtered = ([_driven(env, each, some) for some in scenarios] for each in (policy, act))
         env.close()
-        yield {"task": task, "user": user, "method": method, "change": name, **_row(bench, act, reference, filtered)}
+        found = _row(bench, act, reference, filtered)
+        told = {"answers_otherwise": _answering_otherwise(task, model, filtered)}
+        yield {"task": task, "user": user, "method": method, "change": name, **found, **told}
 
 
 def _changes_of(task: str) -> Sequence[str]:
@@ -200,6 +206,25 @@ def _row(
     }
 
 
+def _answering_otherwise(task: str, model: ForwardModel | None, driven: Sequence[Trajectory]) -> str:
+    """After how many steps of each episode a loop would say that the robot answers otherwise; 0: never."""
+    if model is None:
+        raise ValueError("too few steps to learn a forward model from")
+    names = [field.name for field in registry.task(task).observation.fields for _ in range(field.size)]
+    told = []
+    for each in driven:
+        monitor = DynamicsMonitor(model, names, len(each))
+        told.append(next((step for step, note in enumerate(_notes(monitor, each), 1) if note), 0))
+    return " ".join(map(str, told))
+
+
+def _notes(monitor: DynamicsMonitor, driven: Trajectory) -> Iterator[str]:
+    seen = driven.observations
+    for before, action, after in zip(seen[:-1], driven.actions, seen[1:], strict=True):
+        monitor.step(before, action, after)
+        yield monitor.note()
+
+
 def _summed(bench: BenchmarkUser, measure: Any, some: Sequence[Trajectory]) -> FloatArray:
     """(N,) of whole episodes, for the user's true preference."""
     taste = bench.cell.taste
@@ -227,8 +252,8 @@ def _tables(rows: Sequence[Mapping[str, Any]]) -> str:
             "| changed | "
             + " | ".join(f"{user}: gain, %" for user in users)
             + " | success, points | of the reference, % | harmed | worst force, N | of the reference | shield, % |"
-            + " told |",
-            "|---" * (len(users) + 8) + "|",
+            + " shield told | answers told |",
+            "|---" * (len(users) + 9) + "|",
         ]
         usual = {row["user"]: _strong_shares(row) for row in some if row["change"] == "nothing"}
         for change in CHANGES:
@@ -250,11 +275,13 @@ def _line(change: str, rows: Sequence[Mapping[str, Any] | None], usual: Mapping[
         for row in here
         for share in _strong_shares(row)
     ]
+    after = [int(step) for row in here for step in row["answers_otherwise"].split()]
     return (
         f"| {change} | {' | '.join(_gain(row) if row else '-' for row in rows)}"
         f" | {100 * (successes[0] - successes[1]):+.1f} | {100 * successes[1]:.1f}"
         f" | {sum(int(row['harmed']) for row in here)} of {driven} | {worst[0]:.1f} | {worst[1]:.1f}"
-        f" | {100 * shield:.1f} | {f'{sum(told)} of {len(told)}' if told else '-'} |"
+        f" | {100 * shield:.1f} | {f'{sum(told)} of {len(told)}' if told else '-'}"
+        f" | {f'{sum(step > 0 for step in after)} of {len(after)}' if after else '-'} |"
     )
 
 

@@ -302,7 +302,7 @@ def test_a_shield_that_acts_more_than_in_tests_is_told_once_an_episode_has_been_
 def forward_model(made: Plane) -> ForwardModel:
     """Of its usual episodes, as the studio learns it of an evaluation's."""
     driven = [made.environment.episode(made.filter, scenario, made.policy.mean) for scenario in range(12)]
-    found = filter_finishing._forward_model(made.task, driven)
+    found = filter_finishing.forward_model_of(made.task, driven)
     assert found is not None
     return found
 
@@ -321,7 +321,7 @@ def test_a_robot_whose_actions_come_late_is_told_before_its_episode_ends(
 
         def act(seen: Float32Array) -> Float32Array:
             answer = loop.answer(packed({"observation": seen[:4]} | ({} if told else {"reset": True})))
-            told.append("otherwise than in its tests" in answer["filter"]["why"])
+            told.append("actions come late" in answer["filter"]["why"])
             on_the_way.append(np.asarray(answer["actions"][0], np.float32) / 0.1)
             return on_the_way.popleft()
 

@@ -105,7 +105,7 @@ def finish(fit: FilterFit, draft: FilterDraft, provenance: Provenance, learned: 
         recording=_recording(fit, proven),
         metrics=metrics,
         provenance=provenance,
-        forward_model=_forward_model(task, proven.driven),
+        forward_model=forward_model_of(task, proven.driven),
     )
     return Finished(draft.weights.to_bytes(), bundle.write(contents), metrics)
 
@@ -184,7 +184,7 @@ def usually_at_most(shares: Sequence[float]) -> float:
     return float(np.quantile(shares, 0.99, method="higher"))
 
 
-def _forward_model(task: Task, driven: Sequence[Trajectory]) -> ForwardModel | None:
+def forward_model_of(task: Task, driven: Sequence[Trajectory]) -> ForwardModel | None:
     """Of what clients see: what a loop adds to a laboratory's observations is not measured."""
     seen = own_observation(task)
     widths = np.concatenate([np.full(field.size, field.high - field.low) for field in seen.fields])

@@ -64,7 +64,7 @@ def contents() -> BundleContents:
             "costs": {"weights": {"C_d": {"mean": -0.7, "low": -0.8, "high": -0.6}}, "explained": 0.9},
         },
         provenance=Provenance("demo", "P07", 3, 200, "ab" * 32, 11, "2026-01-02T03:04:05Z", "cd" * 32, "none"),
-        forward_model=ForwardModel(np.zeros((invented.D + 8, invented.D)), np.ones(invented.D), 1.0),
+        forward_model=ForwardModel(np.zeros((invented.D + 8, invented.D)), np.ones(invented.D), 1.0, 0.01),
     )
 
 

@@ -212,6 +212,8 @@ class FilterLoop:
     def _stand_still(self) -> None:
         """The robot has stopped meanwhile, and a chunk is of the past."""
         self._seen, self._previous, self._chunk = None, self._slower(0.0), self._chunk[:0]
+        if self.monitor:
+            self.monitor.go_on()
 
     def _look_at_the_clock(self, now: float, reset: bool) -> None:
         if reset:

@@ -2,12 +2,14 @@
 
     o' - o = [o, a, 1] W + e
     departure = mean over the numbers of o of  log(1 + rms(e) / max(usual rms(e), FLOOR width))
+    lateness = departure - the departure if a were the action of one step before
 
 W comes from a ridge regression over the evaluation's episodes. The rms is over the steps since the episode began, the
 last as many as an episode has. The logarithm keeps a single number that a touch or a rare posture throws far off from
-outweighing all others. How large it usually becomes is measured in each half of the episodes with the W of the other
-half: of 100 episodes that are like these about one exceeds the limit. Noisy sensors, late actions and a tremor depart
-from it within seconds; friction and mass do not (docs/decisions.md, 177).
+outweighing all others. How large both usually become is measured in each half of the episodes with the W of the other
+half: of 100 episodes that are like these about one exceeds a limit. Noise in the sensors and a tremor depart from it
+within seconds, and late actions follow better from the action before; friction and mass do neither (docs/decisions.md,
+177).
 """
 
 import io
@@ -21,8 +23,10 @@ import numpy as np
 FILE = "forward_model.npz"
 FIRST_STEPS = 10
 """Fewer say little."""
-FLOOR = 2e-4
+FLOOR = 1e-3
 """of the width that is declared for a number: sensors may be so much less exact than a simulation's"""
+LEAST_LATENESS = 0.01
+"""With noise that drowns all else lateness is 0 on average, and scatters by less."""
 NARROWEST = 0.01
 """of that width: what moves less in the tests is not extrapolated from"""
 NO_WIDTH = 1e-9
@@ -42,6 +46,7 @@ class ForwardModel:
     usual: Any
     """(D,) root mean square of what it misses"""
     departure_at_most: float
+    lateness_at_most: float
 
     @classmethod
     def learned(cls, episodes: Sequence[tuple[Any, Any]], widths: Any) -> Self | None:
@@ -57,23 +62,22 @@ class ForwardModel:
         missed = [
             _missed(_coefficients(half, widths), *each) for half, other in (halves, halves[::-1]) for each in other
         ]
-        usual = np.maximum(np.sqrt((np.concatenate(missed) ** 2).mean(axis=0)), FLOOR * widths)
-        largest = [_departures(each, usual).max() for each in missed]
-        at_most = float(np.quantile(largest, LIMIT_OF, method="higher"))
-        return cls(_coefficients(episodes, widths), usual, at_most)
+        usual = np.maximum(np.sqrt((np.concatenate(missed)[:, 0] ** 2).mean(axis=0)), FLOOR * widths)
+        largest = [_departure_and_lateness(each, usual).max(axis=0) for each in missed]
+        departure, lateness = np.quantile(largest, LIMIT_OF, axis=0, method="higher").tolist()
+        return cls(_coefficients(episodes, widths), usual, departure, max(lateness, LEAST_LATENESS))
 
     @classmethod
     def from_bytes(cls, stored: bytes) -> Self:
         """Of to_bytes()."""
         with np.load(io.BytesIO(stored), allow_pickle=False) as arrays:
-            return cls(arrays["coefficients"], arrays["usual"], float(arrays["departure_at_most"]))
+            return cls(arrays["coefficients"], arrays["usual"], *arrays["departure_and_lateness_at_most"].tolist())
 
     def to_bytes(self) -> bytes:
         """An .npz file."""
         file = io.BytesIO()
-        np.savez(
-            file, coefficients=self.coefficients, usual=self.usual, departure_at_most=np.float64(self.departure_at_most)
-        )
+        at_most = np.array([self.departure_at_most, self.lateness_at_most])
+        np.savez(file, coefficients=self.coefficients, usual=self.usual, departure_and_lateness_at_most=at_most)
         return file.getvalue()
 
 
@@ -84,32 +88,43 @@ class DynamicsMonitor:
         """``names``: (D,) of the fields that the numbers of the observation belong to."""
         self._model, self._names = model, names
         self._squares = deque[Any](maxlen=episode_steps)
+        self._before: tuple[Any, Any] | None = None
 
     def begin(self) -> None:
         """An episode."""
         self._squares.clear()
+        self.go_on()
+
+    def go_on(self) -> None:
+        """After a pause: what was done before it says nothing of what is seen now."""
+        self._before = None
 
     def step(self, before: Any, action: Any, after: Any) -> None:
         """(D,), (A,), (D,): what was seen, what was done in [-1, 1], and what was seen then."""
-        missed = _missed(self._model.coefficients, np.stack([before, after]), np.asarray(action)[None])[0]
-        self._squares.append((missed / self._model.usual) ** 2)
-
-    @property
-    def departures(self) -> Any:
-        """(D,) of how many times as far off as usual; None while that is not known."""
-        return np.sqrt(np.mean(self._squares, axis=0)) if len(self._squares) >= FIRST_STEPS else None
+        if self._before is not None:
+            observations, actions = np.stack([self._before[0], before, after]), np.stack([self._before[1], action])
+            self._squares.append((_missed(self._model.coefficients, observations, actions)[0] / self._model.usual) ** 2)
+        self._before = before, action
 
     def note(self) -> str:
         """That the world is another than the tests'; empty: it is as usual."""
-        each, at_most = self.departures, self._model.departure_at_most
-        if each is None or _departure(each) <= at_most:
+        if len(self._squares) < FIRST_STEPS:
             return ""
-        off, usual = np.expm1(_departure(each)), np.expm1(at_most)
-        return (
-            f"what is seen follows from what is done otherwise than in its tests: it is {off:.1f} times as far off as "
-            f"usual, most of all {self._names[int(each.argmax())]}, where 99 of 100 episodes stay below {usual:.1f}; "
-            "look for noisy sensors and late actions before anybody is touched"
-        )
+        off = np.sqrt(np.mean(self._squares, axis=0))
+        departure, if_late = _departure(off)
+        if departure - if_late > self._model.lateness_at_most:
+            return (
+                "what is seen follows from the action before the last better than from the last: actions come late, "
+                "which they did not in its tests; measure by how much before anybody is touched"
+            )
+        if departure > self._model.departure_at_most:
+            times = np.expm1(departure) / np.expm1(self._model.departure_at_most)
+            return (
+                f"what is seen follows from actions otherwise than in its tests: {times:.1f} times as far off as in 99 of "
+                f"100 episodes there, most of all {self._names[int(off[0].argmax())]}; look for noise in the sensors, "
+                "tremors, and another robot"
+            )
+        return ""
 
 
 def _features(observations: Any, actions: Any) -> Any:
@@ -131,16 +146,19 @@ def _coefficients(episodes: Sequence[tuple[Any, Any]], widths: Any) -> Any:
 
 
 def _missed(coefficients: Any, observations: Any, actions: Any) -> Any:
-    """(T + 1, D), (T, A) -> (T, D)"""
-    return np.diff(observations.astype(np.float64), axis=0) - _features(observations[:-1], actions) @ coefficients
+    """(T + 1, D), (T, A) -> (T - 1, 2, D) from the second step on: of the action, and of the one before it"""
+    changes = np.diff(observations[1:].astype(np.float64), axis=0)
+    followed = [_features(observations[1:-1], some) @ coefficients for some in (actions[1:], actions[:-1])]
+    return changes[:, None] - np.stack(followed, axis=1)
 
 
-def _departures(missed: Any, usual: Any) -> Any:
-    """(T, D) -> (steps,) after each step from the first on that says enough."""
-    squares = np.cumsum((missed / usual) ** 2, axis=0) / np.arange(1, len(missed) + 1)[:, None]
-    return _departure(np.sqrt(squares))[min(FIRST_STEPS, len(missed)) - 1 :]
-
-
-def _departure(each: Any) -> Any:
+def _departure(off: Any) -> Any:
     """(..., D) -> (...)"""
-    return np.log1p(each).mean(axis=-1)
+    return np.log1p(off).mean(axis=-1)
+
+
+def _departure_and_lateness(missed: Any, usual: Any) -> Any:
+    """(T, 2, D) -> (steps, 2) after each step from the first on that says enough."""
+    squares = np.cumsum((missed / usual) ** 2, axis=0) / np.arange(1, len(missed) + 1)[:, None, None]
+    departure, if_late = _departure(np.sqrt(squares))[min(FIRST_STEPS, len(missed)) - 1 :].T
+    return np.stack([departure, departure - if_late], axis=1)

@@ -46,6 +46,8 @@ _LIMITS = """## Limits
 * "Preference" is the return of a model learned from this person's own labels, not their satisfaction.
 * The largest speeds and forces are what happened in these simulated scenarios. They are not guaranteed bounds: keep the
   robot's own limits on speed and force, and an emergency stop within reach.
+* A robot that acts later or sees less exactly than the simulated one may press harder and fail more often: measure its
+  delay first. A loop (`run_filter.py --serve`) tells within seconds when what is seen follows from actions otherwise.
 * The filter belongs to one reference policy (`policy` in the manifest) and one person."""
 
 
