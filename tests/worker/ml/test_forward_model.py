@@ -98,4 +98,8 @@ def test_nothing_is_learned_from_too_few_steps() -> None:
     rng = np.random.default_rng(0)
     assert ForwardModel.learned([], WIDTHS) is None
     assert ForwardModel.learned([episode(rng)], WIDTHS) is None
-    assert ForwardModel.learned([(seen[:4], done[:3]) for seen, done in map(episode, [rng] * 4)], WIDTHS) is None
+    for steps in (0, 1, 3):
+        some = [(seen[: steps + 1], done[:steps]) for seen, done in map(episode, [rng] * 4)]
+        assert ForwardModel.learned(some, WIDTHS) is None
+    some = [(seen[:2], done[:1]) for seen, done in map(episode, [rng] * 40)]
+    assert ForwardModel.learned(some, WIDTHS) is None, "nothing follows in an episode of one step"

@@ -55,6 +55,7 @@ class ForwardModel:
         ``widths``: (D,) of the ranges that are declared for the numbers of the observation.
         """
         widths = np.maximum(widths, NO_WIDTH)
+        episodes = [(seen, done) for seen, done in episodes if len(done) > 1]
         halves = episodes[::2], episodes[1::2]
         size = len(widths) + 1 + episodes[0][1].shape[1] if episodes else 0
         if min(sum(len(actions) for _, actions in half) for half in halves) <= size:
@@ -120,9 +121,9 @@ class DynamicsMonitor:
         if departure > self._model.departure_at_most:
             times = np.expm1(departure) / np.expm1(self._model.departure_at_most)
             return (
-                f"what is seen follows from actions otherwise than in its tests: {times:.1f} times as far off as in 99 of "
-                f"100 episodes there, most of all {self._names[int(off[0].argmax())]}; look for noise in the sensors, "
-                "tremors, and another robot"
+                f"what is seen follows from actions otherwise than in its tests: {times:.1f} times as far off as in 99 "
+                f"of 100 episodes there, most of all {self._names[int(off[0].argmax())]}; look for noise in the "
+                "sensors, tremors, and another robot"
             )
         return ""
 
