@@ -214,15 +214,15 @@ def _answering_otherwise(task: str, model: ForwardModel | None, driven: Sequence
     told = []
     for each in driven:
         monitor = DynamicsMonitor(model, names, len(each))
-        told.append(next((step for step, note in enumerate(_notes(monitor, each), 1) if note), 0))
+        told.append(next((step for step, notes in enumerate(_notes(monitor, each), 1) if notes), 0))
     return " ".join(map(str, told))
 
 
-def _notes(monitor: DynamicsMonitor, driven: Trajectory) -> Iterator[str]:
+def _notes(monitor: DynamicsMonitor, driven: Trajectory) -> Iterator[Mapping[str, str]]:
     seen = driven.observations
     for before, action, after in zip(seen[:-1], driven.actions, seen[1:], strict=True):
         monitor.step(before, action, after)
-        yield monitor.note()
+        yield monitor.notes()
 
 
 def _summed(bench: BenchmarkUser, measure: Any, some: Sequence[Trajectory]) -> FloatArray:

@@ -293,6 +293,7 @@ def test_a_shield_that_acts_more_than_in_tests_is_told_once_an_episode_has_been_
     assert told.index(True) == 0.2 * len(said)
     assert all(told[told.index(True) :])
     assert "in 100% of the steps the shield" in said[-1]["why"]
+    assert "shield" in said[-1]["unlike_tests"]
     assert f"the shield active in {2 * len(said)}" in str(loop.counted)
     loop.begin_connection()
     assert not any(tells(each) for each in episode(1.5)[:-1])
@@ -321,7 +322,7 @@ def test_a_robot_whose_actions_come_late_is_told_before_its_episode_ends(
 
         def act(seen: Float32Array) -> Float32Array:
             answer = loop.answer(packed({"observation": seen[:4]} | ({} if told else {"reset": True})))
-            told.append("actions come late" in answer["filter"]["why"])
+            told.append("late" in answer["filter"]["unlike_tests"])
             on_the_way.append(np.asarray(answer["actions"][0], np.float32) / 0.1)
             return on_the_way.popleft()
 
@@ -331,6 +332,7 @@ def test_a_robot_whose_actions_come_late_is_told_before_its_episode_ends(
     assert not any(episode(late=0))
     assert episode(late=2).index(True) < 20
     assert not any(episode(late=0)), "an episode begins anew"
+    assert f"late in {loop.counted.unlike_tests['late']}" in str(loop.counted)
     loop.close()
 
 

@@ -82,6 +82,8 @@ class Counted:
     states: dict[str, int] = field(default_factory=dict)
     pauses: int = 0
     shielded: int = 0
+    unlike_tests: dict[str, int] = field(default_factory=dict)
+    """In how many steps what was told"""
     whole_ms: list[float] = field(default_factory=list)
     policy_ms: list[float] = field(default_factory=list)
     filter_ms: list[float] = field(default_factory=list)
@@ -97,9 +99,12 @@ class Counted:
     def __str__(self) -> str:
         rate = "unknown" if self.rate_hz is None else f"{self.rate_hz:.1f} Hz"
         states = ", ".join(f"{count} {state}" for state, count in sorted(self.states.items())) or "none"
+        told = ", ".join(f"{what} in {steps}" for what, steps in self.unlike_tests.items())
+        unlike = f"; unlike the tests: {told}" if told else ""
         return (
             f"{self.steps} steps ({states}), the shield active in {self.shielded}, rate {rate}, {self.pauses} pauses; "
             f"whole {_spread(self.whole_ms)}, policy {_spread(self.policy_ms)}, filter {_spread(self.filter_ms)}"
+            f"{unlike}"
         )
 
 
@@ -186,7 +191,15 @@ class FilterLoop:
         self.counted.states[state] = self.counted.states.get(state, 0) + 1
         self._answered_s = time.perf_counter()
         self.counted.whole_ms.append(1000 * (self._answered_s - now))
-        said = {"state": state, "why": why or self._notes(), "shield": shield}
+        unlike = self._unlike_tests()
+        for what in unlike:
+            self.counted.unlike_tests[what] = self.counted.unlike_tests.get(what, 0) + 1
+        said = {
+            "state": state,
+            "why": why or "; ".join(unlike.values()),
+            "unlike_tests": list(unlike),
+            "shield": shield,
+        }
         return {**others, "actions": self._outside(action)[None], "filter": said}
 
     def first_said(self, observation: Any) -> Any:
@@ -303,10 +316,11 @@ class FilterLoop:
         slower = self._in_unit(factor * self._outside(self._previous))
         return np.where(self._moving, slower, self._previous).astype(np.float32)
 
-    def _notes(self) -> str:
-        """What else is not as it was in tests."""
-        dynamics = self.monitor.note() if self.monitor else ""
-        return "; ".join(filter(None, (self._rate_note(), dynamics, self._shield_note())))
+    def _unlike_tests(self) -> dict[str, str]:
+        """What is not as it was in tests, and in words."""
+        dynamics = self.monitor.notes() if self.monitor else {}
+        every = {"rate": self._rate_note(), **dynamics, "shield": self._shield_note()}
+        return {what: note for what, note in every.items() if note}
 
     def _shield_note(self) -> str:
         """Of the last as many steps as an episode has: how active a shield is differs within it."""

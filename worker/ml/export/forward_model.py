@@ -107,25 +107,25 @@ class DynamicsMonitor:
             self._squares.append((_missed(self._model.coefficients, observations, actions)[0] / self._model.usual) ** 2)
         self._before = before, action
 
-    def note(self) -> str:
-        """That the world is another than the tests'; empty: it is as usual."""
+    def notes(self) -> dict[str, str]:
+        """That actions are "late", or the "dynamics" other than in tests, in words; empty: they are as usual."""
         if len(self._squares) < FIRST_STEPS:
-            return ""
+            return {}
         off = np.sqrt(np.mean(self._squares, axis=0))
         departure, if_late = _departure(off)
         if departure - if_late > self._model.lateness_at_most:
-            return (
-                "what is seen follows from the action before the last better than from the last: actions come late, "
-                "which they did not in its tests; measure by how much before anybody is touched"
-            )
+            return {
+                "late": "what is seen follows from the action before the last better than from the last: actions come "
+                "late, which they did not in its tests; measure by how much before anybody is touched"
+            }
         if departure > self._model.departure_at_most:
             times = np.expm1(departure) / np.expm1(self._model.departure_at_most)
-            return (
-                f"what is seen follows from actions otherwise than in its tests: {times:.1f} times as far off as in 99 "
-                f"of 100 episodes there, most of all {self._names[int(off[0].argmax())]}; look for noise in the "
-                "sensors, tremors, and another robot"
-            )
-        return ""
+            return {
+                "dynamics": f"what is seen follows from actions otherwise than in its tests: {times:.1f} times as far "
+                f"off as in 99 of 100 episodes there, most of all {self._names[int(off[0].argmax())]}; look for noise "
+                "in the sensors, tremors, and another robot"
+            }
+        return {}
 
 
 def _features(observations: Any, actions: Any) -> Any:
