@@ -2,8 +2,8 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from itertools import product
+from dataclasses import dataclass, replace
+from itertools import chain, product
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
@@ -18,7 +18,7 @@ _REFINED = (
 )
 _DOUBTED = "The answers do not say clearly enough that the refined policy is better, and it is off."
 STRENGTHS = (1.0, 0.8, 0.6)
-"""Tried in this order, blended with the reference policy."""
+"""Blended with the reference policy."""
 LARGEST_LOSS = 0.01
 """of success in the scenarios of the check. In truth two points may be lost: who loses that much passes in one of eight
 cases, who loses half a point in more than nine of ten (decision 161)"""
@@ -29,6 +29,16 @@ SURE = 0.9
 """Chance, as the reward model's members see it, from which on it is believed to be better than the reference policy. A
 refinement goes far, so it must be far from where answers say little: who wanted the robot on time lost 11 % by one that
 had 8 in 10, who minds only what is beyond a limit gained 21 % by one that had 96 in 100 (decision 166)"""
+
+
+@dataclass(frozen=True)
+class _Passing:
+    """What the gate lets through, which has to pass the check yet."""
+
+    preference: float
+    draft: FilterDraft
+    gate: float
+    driven: Sequence[Trajectory]
 
 
 def try_refined(
@@ -50,25 +60,34 @@ def gate_refined(
 ) -> FilterDraft:
     """As much of the refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
 
-    ``drafts``: of refine(). What had been best on the way is tried where nothing of the last one is good enough.
-    ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
+    ``drafts``: of refine(). The whole last policy is tried first, and is mostly it. Where it is not good enough, less
+    of it and what had been best on the way are tried, and what gains most of these comes first. ``more_reference``:
+    the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
     """
-    started, (draft, *_), is_doubted = time.perf_counter(), drafts, False
-    least = LEAST_LIFT * to_beat(problem, draft, reference)
-    for candidate, gate in product(drafts, STRENGTHS):
-        progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-        trial, driven = try_refined(problem, candidate, gate, reference, collect)
-        draft = replace(draft, trials=(*draft.trials, trial))
-        if trial.preference <= max(least, 0.0) or not keeps_task(problem, trial, reference):
-            continue
-        if trial.chance is not None and trial.chance < SURE:
-            is_doubted = True
-            continue
-        checked, _ = try_refined(problem, candidate, gate, more_reference(), collect)
+    started, draft, is_doubted = time.perf_counter(), drafts[0], False
+    least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
+
+    def passing(tries: Sequence[tuple[FilterDraft, float]]) -> list[_Passing]:
+        nonlocal draft, is_doubted
+        found = []
+        for candidate, gate in tries:
+            progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
+            trial, driven = try_refined(problem, candidate, gate, reference, collect)
+            draft = replace(draft, trials=(*draft.trials, trial))
+            if trial.preference > least and keeps_task(problem, trial, reference):
+                if trial.chance is None or trial.chance >= SURE:
+                    found.append(_Passing(trial.preference, candidate, gate, driven))
+                else:
+                    is_doubted = True
+        return sorted(found, key=lambda each: -each.preference)
+
+    whole, *others = product(drafts, STRENGTHS)
+    for each in chain.from_iterable(map(passing, ([whole], others))):  # the others only where the whole is refused
+        checked, _ = try_refined(problem, each.draft, each.gate, more_reference(), collect)
         draft = replace(draft, trials=(*draft.trials, checked))
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
-            weights = candidate.weights.changed(gate=gate)
-            tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
+            weights = each.draft.weights.changed(gate=each.gate)
+            tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
             return draft.timed("gate_refined", started)
     why = _DOUBTED if is_doubted else "The refined policy was no better on held-out scenarios and is off."
