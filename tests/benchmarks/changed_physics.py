@@ -177,8 +177,7 @@ def _scale(world: Bullet, names: Sequence[str], friction: float, mass: float) ->
 def _with_noise(seen: Float32Array, space: Space, noise: float, rng: np.random.Generator) -> Float32Array:
     if noise == 0.0:
         return seen
-    widths = np.concatenate([np.full(field.size, field.high - field.low) for field in space.fields])
-    return np.asarray(seen + noise * widths * rng.standard_normal(len(seen)), np.float32)
+    return np.asarray(seen + noise * space.widths * rng.standard_normal(len(seen)), np.float32)
 
 
 # -- what came of it ---------------------------------------------------------------------------------------------------

@@ -187,8 +187,7 @@ def usually_at_most(shares: Sequence[float]) -> float:
 def forward_model_of(task: Task, driven: Sequence[Trajectory]) -> ForwardModel | None:
     """Of what clients see: what a loop adds to a laboratory's observations is not measured."""
     seen = own_observation(task)
-    widths = np.concatenate([np.full(field.size, field.high - field.low) for field in seen.fields])
-    return ForwardModel.learned([(each.observations[:, : seen.size], each.actions) for each in driven], widths)
+    return ForwardModel.learned([(each.observations[:, : seen.size], each.actions) for each in driven], seen.widths)
 
 
 def _strengths(weights: FilterWeights) -> dict[str, float]:

@@ -7,6 +7,10 @@ the table for whoever connects a real robot.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
+from worker.domain.type_aliases import FloatArray
+
 
 @dataclass(frozen=True)
 class Field:
@@ -30,6 +34,11 @@ class Space:
     def size(self) -> int:
         """Length of the flattened vector."""
         return sum(field.size for field in self.fields)
+
+    @property
+    def widths(self) -> FloatArray:
+        """(size,) of the declared range of every number."""
+        return np.repeat([field.high - field.low for field in self.fields], [field.size for field in self.fields])
 
     def slices(self) -> Iterator[tuple[Field, slice]]:
         """Every field with its place in the vector."""

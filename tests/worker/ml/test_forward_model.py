@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from worker.ml.export.forward_model import FIRST_STEPS, DynamicsMonitor, ForwardModel
+from worker.ml.export.forward_model import FIRST_STEPS, LARGEST, DynamicsMonitor, ForwardModel
 
 STEPS = 40
 WIDTHS = np.array([4.0, 4.0, 4.0, 4.0, 20.0, 1.0])
@@ -91,6 +91,12 @@ def test_what_is_furthest_off_is_named_and_a_new_episode_begins_anew() -> None:
     assert "most of all target_m" in monitor.notes()["dynamics"]
     monitor.begin()
     assert monitor.notes() == {}
+
+
+def test_nothing_is_learned_of_pictures() -> None:
+    rng = np.random.default_rng(0)
+    some = [(rng.random((STEPS + 1, LARGEST)), rng.random((STEPS, 2))) for _ in range(40)]
+    assert ForwardModel.learned(some, np.ones(LARGEST)) is None
 
 
 def test_nothing_is_learned_from_too_few_steps() -> None:

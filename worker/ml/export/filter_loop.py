@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 if __package__:
-    from worker.ml.export import forward_model
     from worker.ml.export.forward_model import DynamicsMonitor, ForwardModel
     from worker.ml.export.run_filter import strong_share, unusual_activity, usual_strong_share
     from worker.ml.policies.policy_client import (
@@ -38,8 +37,10 @@ if __package__:
         unpacked,
     )
 else:  # in a bundle they lie beside this file
-    import forward_model  # type: ignore[import-not-found, no-redef]  # in bundles
-    from forward_model import DynamicsMonitor, ForwardModel  # type: ignore[no-redef]  # in bundles
+    from forward_model import (  # type: ignore[import-not-found, no-redef]  # in bundles
+        DynamicsMonitor,
+        ForwardModel,
+    )
     from policy_client import (  # type: ignore[import-not-found, no-redef]  # in bundles
         PolicyFunction,
         PolicyServer,
@@ -144,9 +145,9 @@ class FilterLoop:
     def compare_with_tests(self, manifest: Mapping[str, Any], bundle: Path) -> None:
         """Tell when the world is another than in the tests of this bundle; those of earlier versions know less."""
         self.usual_strong_share = usual_strong_share(manifest)
-        if (stored := bundle / forward_model.FILE).exists():
+        model = ForwardModel.of_bundle(bundle)
+        if model is not None:
             names = [each["name"] for each in self.interface["observation"] for _ in range(each["size"])]
-            model = ForwardModel.from_bytes(stored.read_bytes())
             self.monitor = DynamicsMonitor(model, names, self.interface["episode_steps"])
 
     def begin_connection(self) -> None:

@@ -16,6 +16,7 @@ import io
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -33,6 +34,9 @@ NO_WIDTH = 1e-9
 """of a number that is declared not to change"""
 RIDGE = 1e-3
 """beside squares of mean 1"""
+LARGEST = 500
+"""numbers of an observation and an action. Larger ones hold pictures or point clouds, of which no linear model says
+much, and its square of numbers would fill a bundle."""
 LIMIT_OF = 0.99
 """of the tests' episodes"""
 
@@ -52,13 +56,14 @@ class ForwardModel:
     def learned(cls, episodes: Sequence[tuple[Any, Any]], widths: Any) -> Self | None:
         """From observations (T + 1, D) and actions (T, A) of whole episodes; None if there are too few to learn from.
 
-        ``widths``: (D,) of the ranges that are declared for the numbers of the observation.
+        None, too, for observations of more than LARGEST numbers. ``widths``: (D,) of the ranges that are declared for
+        the numbers of the observation.
         """
         widths = np.maximum(widths, NO_WIDTH)
         episodes = [(seen, done) for seen, done in episodes if len(done) > 1]
         halves = episodes[::2], episodes[1::2]
         size = len(widths) + 1 + episodes[0][1].shape[1] if episodes else 0
-        if min(sum(len(actions) for _, actions in half) for half in halves) <= size:
+        if size > LARGEST or min(sum(len(actions) for _, actions in half) for half in halves) <= size:
             return None
         missed = [
             _missed(_coefficients(half, widths), *each) for half, other in (halves, halves[::-1]) for each in other
@@ -67,6 +72,12 @@ class ForwardModel:
         largest = [_departure_and_lateness(each, usual).max(axis=0) for each in missed]
         departure, lateness = np.quantile(largest, LIMIT_OF, axis=0, method="higher").tolist()
         return cls(_coefficients(episodes, widths), usual, departure, max(lateness, LEAST_LATENESS))
+
+    @classmethod
+    def of_bundle(cls, folder: Path) -> Self | None:
+        """None: the bundle has none, as those of earlier versions."""
+        stored = folder / FILE
+        return cls.from_bytes(stored.read_bytes()) if stored.exists() else None
 
     @classmethod
     def from_bytes(cls, stored: bytes) -> Self:

@@ -122,8 +122,7 @@ def untried(observation: Space, action_size: int, reference: Sequence[Trajectory
 
 def _box(name: str, space: Space, values: Float32Array) -> dict[str, Float32Array]:
     low, high = values.min(axis=0), values.max(axis=0)
-    declared = np.concatenate([np.full(field.size, field.high - field.low) for field in space.fields])
-    ramp = np.maximum(RAMP * (high - low), NARROWEST * declared)
+    ramp = np.maximum(RAMP * (high - low), NARROWEST * space.widths)
     return {
         f"{name}_{end}": np.asarray(array, np.float32) for end, array in (("low", low), ("high", high), ("ramp", ramp))
     }
