@@ -1,5 +1,6 @@
 """A laboratory of our own: a point that moves to a place on a plane, with a policy of one layer. Cheap, and real."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -8,8 +9,11 @@ import pytest
 
 from app.installed_tasks import catalogue
 from app.web.texts import wording
+from tests.lab.filtered_plane import Plane
+from tests.lab.policy_server import Answer, serving, to_goal
 from tests.worker.traced import traced_once  # noqa: F401
 from worker.compute import simulation
+from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import mlp_to_onnx
 from worker.tasks import registry
 
@@ -141,3 +145,17 @@ def use(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], None]]:
     yield name
     monkeypatch.delenv("LAB_TASKS", raising=False)
     forget()
+
+
+@pytest.fixture
+def plane_of(plane: Path) -> Iterator[Callable[..., Plane]]:
+    """Makes it, with a policy server that gives these answers."""
+    with contextlib.ExitStack() as stack:
+
+        def make(answer: Answer = to_goal) -> Plane:
+            made = Plane(plane, stack.enter_context(serving(answer)))
+            stack.callback(made.environment.close)
+            return made
+
+        yield make
+    asked_policy.forget()

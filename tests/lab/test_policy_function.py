@@ -13,8 +13,8 @@ from app.domain.study_settings import StudySettings
 from app.installed_tasks import lab
 from app.installed_tasks.lab import LabDescription
 from app.services.studies import task_limits
+from tests.lab.filtered_plane import MODE, PATIENT, ended, served, written
 from tests.lab.test_check import change, found, said
-from tests.lab.test_serve_filter import MODE, PATIENT, ended, served, written
 from worker.compute import simulation
 from worker.compute.lab_policies import policy_of
 from worker.experiments import fit_response_surface

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from tests.lab.filtered_plane import Plane, written
 from tests.lab.policy_server import serving, to_goal
-from tests.lab.test_serve_filter import Plane, written
 from worker.ml.policies import asked_policy
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ros2" / "filter_node.py"
