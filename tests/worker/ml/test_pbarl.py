@@ -266,6 +266,20 @@ def test_a_residual_has_to_be_better_than_the_mode_though_a_refinement_was_refus
     assert gated.weights.residual_share == 0.0
 
 
+@pytest.mark.parametrize(
+    ("slowest", "tried", "kept"), [(0.0, [1.0, 1.5, 2.0], 2.0), (0.019, [1.0, 1.5], 1.0), (0.021, [1.0, 0.5], 0.5)]
+)
+def test_more_of_a_residual_than_was_learned_is_kept_while_it_is_better_and_nothing_more_fails(
+    slowest: float, tried: list[float], kept: float, reference: list[Trajectory]
+) -> None:
+    """For somebody who dislikes speed, where whatever is slower than ``slowest`` fails."""
+    asked = problem(-1.0, reference)
+    learned = learn_round(asked, FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)])
+    gated = residual.gate_residual(asked, learned, reference, World(slowest).collect)
+    assert [each.residual_share for each in gated.trials] == tried
+    assert gated.weights.residual_share == kept
+
+
 def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surface: ResponseSurface) -> None:
     def refined(draft: FilterDraft) -> FilterDraft:
         return replace(draft, weights=draft.weights.changed(refined=POLICY.weights))

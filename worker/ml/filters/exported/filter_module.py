@@ -38,7 +38,7 @@ class FilterWeights:
     """the person's mode by the names of its axes; an axis that is not named is 0"""
     gate: float = 1.0
     residual_share: float = 1.0
-    """share of the encoder's residual that is used; 0 means the mode alone"""
+    """how much of the residual is used, as a share of what was learned; 0: the mode alone, above 1: further that way"""
     encoder: Mapping[str, Float32Array] = field(default_factory=dict)
     """state of ResidualAdapter or PrintedEncoder; empty: none was trained"""
     shield: Mapping[str, Float32Array] = field(default_factory=dict)

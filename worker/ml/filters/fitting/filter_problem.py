@@ -79,6 +79,8 @@ class FilterConfig:
     kl_weight: float = 1e-3
     residual_shares: tuple[float, ...] = (1.0, 0.5)
     """tried in this order until one is acceptable and better than the mode alone"""
+    residual_beyond: tuple[float, ...] = (1.5, 2.0)
+    """tried in this order after the whole was kept, as long as each is better and fails no more often than the last"""
     evaluation_scenarios: int = 100
 
     def gate_block(self, task: Task) -> range:
