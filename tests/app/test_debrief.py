@@ -116,14 +116,23 @@ def test_a_change_too_small_to_be_noticed_is_not_spoken_of_however_certain() -> 
     assert debrief.lessons_of(measured([-LEAST, LEAST - 0.01, 0, 0, 0, 0])) == [debrief.Lesson("C_d-less", 5)]
 
 
-def test_a_multiple_of_almost_nothing_is_called_much_and_not_a_percentage(at_debrief: TakingPart) -> None:
-    metrics = factories.filter_metrics()
-    spilled = {"reference": 0.01, "filter": 0.27, "delta": 0.26, "low": 0.2, "high": 0.3}
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        (0.01, 0.27, "It spills a little more on you; before, it was next to nothing."),
+        (0.6, 1.7, "It spills much more on you."),
+    ],
+)
+def test_more_than_double_is_no_percentage_and_only_much_where_it_is(
+    at_debrief: TakingPart, before: float, after: float, sentence: str
+) -> None:
+    metrics, delta = factories.filter_metrics(), after - before
+    spilled = {"reference": before, "filter": after, "delta": delta, "low": 0.9 * delta, "high": 1.1 * delta}
     metrics["evaluation"]["costs"]["C_fd"] = spilled
     add_filter(at_debrief, metrics)
     page = at_debrief.browser.get("/p/debrief").text
-    assert "It spills much more on you." in page
-    assert "2,600" not in page
+    assert sentence in page
+    assert f"{round(100 * delta / before):,}" not in page
 
 
 def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: TakingPart) -> None:

@@ -18,6 +18,9 @@ MOST_LESSONS = 4
 MOST_PERCENT = 100
 NOTICED_PERCENT = 5
 """Of what it was before: smaller differences of speed or force are hardly noticed, however certain they are."""
+_MUCH = {"C_f": 10.0, "C_hf": 10.0, "C_fd": 1.0}
+"""From which difference on more than double is called much, per episode: newtons summed over control steps of .1 s,
+pieces. Less is a little more, of next to nothing. Where a symbol is not in here, more than double is always much."""
 _TOGETHER = {
     ("less", "more"): "pace-quicker",
     ("more", "less"): "pace-calmer",
@@ -96,12 +99,13 @@ def lessons_of(changes: Sequence[model_metrics.Change]) -> Sequence[Lesson]:
     """What is to be said about measured changes of the six costs, the largest first; no two contradict each other."""
     noticed = {change.symbol: _percent(change) for change in changes if _is_noticed(change)}
     more = {change.symbol: change.delta > 0 for change in changes}
+    how = {change.symbol: _how(change) for change in changes}
     lessons = []
     if {"C_d", "C_v"} <= noticed.keys():
         distance, motion = ("more" if more[symbol] else "less" for symbol in ("C_d", "C_v"))
         noticed.pop("C_d")
         lessons.append(Lesson(_TOGETHER[distance, motion], noticed.pop("C_v")))
-    lessons += [Lesson(f"{symbol}-{_how(more[symbol], percent)}", percent) for symbol, percent in noticed.items()]
+    lessons += [Lesson(f"{symbol}-{how[symbol]}", percent) for symbol, percent in noticed.items()]
     return sorted(lessons, key=lambda lesson: -lesson.percent)
 
 
@@ -115,8 +119,10 @@ def _percent(change: model_metrics.Change) -> int:
     return round(100 * abs(change.delta) / abs(change.reference)) if change.reference else 0
 
 
-def _how(more: bool, percent: int) -> str:
-    """less, more, or much: more than double is a multiple of little, and its percentage would only frighten."""
-    if not more:
+def _how(change: model_metrics.Change) -> str:
+    """less, more, or, since a percentage above 100 would only frighten, much or a little."""
+    if change.delta <= 0:
         return "less"
-    return "much" if percent > MOST_PERCENT else "more"
+    if _percent(change) <= MOST_PERCENT:
+        return "more"
+    return "much" if change.delta >= _MUCH.get(change.symbol, 0.0) else "little"
