@@ -133,6 +133,7 @@ def test_more_than_double_is_no_percentage_and_only_much_where_it_is(
     page = at_debrief.browser.get("/p/debrief").text
     assert sentence in page
     assert f"{round(100 * delta / before):,}" not in page
+    assert (page.index(sentence) > page.index("presses less hard")) == ("little" in sentence)
 
 
 def test_a_robot_that_learned_nothing_certain_is_not_made_more_of(at_debrief: TakingPart) -> None:

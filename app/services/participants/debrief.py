@@ -21,6 +21,7 @@ NOTICED_PERCENT = 5
 _MUCH = {"C_f": 10.0, "C_hf": 10.0, "C_fd": 1.0}
 """From which difference on more than double is called much, per episode: newtons summed over control steps of .1 s,
 pieces. Less is a little more, of next to nothing. Where a symbol is not in here, more than double is always much."""
+_LITTLE = "little"
 _TOGETHER = {
     ("less", "more"): "pace-quicker",
     ("more", "less"): "pace-calmer",
@@ -96,7 +97,7 @@ def learned(session: Session, participant: Participant) -> Learned | None:
 
 
 def lessons_of(changes: Sequence[model_metrics.Change]) -> Sequence[Lesson]:
-    """What is to be said about measured changes of the six costs, the largest first; no two contradict each other."""
+    """What is to be said of measured changes of the six costs, the largest first, little ones last; none contradict."""
     noticed = {change.symbol: _percent(change) for change in changes if _is_noticed(change)}
     more = {change.symbol: change.delta > 0 for change in changes}
     how = {change.symbol: _how(change) for change in changes}
@@ -106,7 +107,7 @@ def lessons_of(changes: Sequence[model_metrics.Change]) -> Sequence[Lesson]:
         noticed.pop("C_d")
         lessons.append(Lesson(_TOGETHER[distance, motion], noticed.pop("C_v")))
     lessons += [Lesson(f"{symbol}-{how[symbol]}", percent) for symbol, percent in noticed.items()]
-    return sorted(lessons, key=lambda lesson: -lesson.percent)
+    return sorted(lessons, key=lambda lesson: (lesson.words.endswith(_LITTLE), -lesson.percent))
 
 
 def _is_noticed(change: model_metrics.Change) -> bool:
@@ -125,4 +126,4 @@ def _how(change: model_metrics.Change) -> str:
         return "less"
     if _percent(change) <= MOST_PERCENT:
         return "more"
-    return "much" if change.delta >= _MUCH.get(change.symbol, 0.0) else "little"
+    return "much" if change.delta >= _MUCH.get(change.symbol, 0.0) else _LITTLE
