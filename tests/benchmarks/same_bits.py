@@ -113,7 +113,8 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is learned with rollouts."""
     setting = bench.setting()
     gate = setting.reference(FILTER.gate_block(bench.task))
-    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect).shielded()
+    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
+    draft = draft.shielded(bench.task.observation, lambda: setting.reference(FILTER.home_block(bench.task)))
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
     beginning = Beginning(setting.make_env, setting.pool, gate, gate, setting.collect)

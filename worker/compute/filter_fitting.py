@@ -142,7 +142,7 @@ class FilterFit:
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""
-        draft = draft.shielded()
+        draft = draft.shielded(self.problem.task.observation, self._home_reference)
         if draft.weights.moves_nothing:
             return harm_tests.untested(draft, self.promise, self.version)
         started = time.perf_counter()
@@ -196,6 +196,9 @@ class FilterFit:
 
     def _check_reference(self) -> Sequence[Trajectory]:
         return self.reference(self.problem.config.check_block(self.problem.task))
+
+    def _home_reference(self) -> Sequence[Trajectory]:
+        return self.reference(self.problem.config.home_block(self.problem.task))
 
     def act_of(self, weights: FilterWeights) -> FilterAct:
         """The filter around its policy."""

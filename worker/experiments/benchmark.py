@@ -174,10 +174,10 @@ def _fill_caches(compute: Compute, processes: int, missing: Sequence[Cell], term
     """Rollouts that all cells of a task share, first and in parallel."""
     jobs = []
     for task in dict.fromkeys(cell.task for cell in missing):
-        gate = terms.filter.gate_block(registry.task(task))
+        blocks = [each(registry.task(task)) for each in (terms.filter.gate_block, terms.filter.home_block)]
         jobs += [(task, work, "behaviours", chunk) for chunk in _chunks(terms.pool)]
         unseen = [terms.unseen(seed) for seed in dict.fromkeys(cell.seed for cell in missing)]
-        jobs += [(task, work, "reference", chunk) for part in (*unseen, gate) for chunk in _chunks(part)]
+        jobs += [(task, work, "reference", chunk) for part in (*unseen, *blocks) for chunk in _chunks(part)]
     _in_parallel(compute, processes, "shared rollouts", fill_shelf, jobs)
 
 

@@ -13,7 +13,7 @@ from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights, build
 from worker.ml.filters.exported.filter_onnx import OnnxFilter, largest_difference, to_onnx
-from worker.ml.filters.exported.shield import FORCE_RAMP_N, described, limits_of
+from worker.ml.filters.exported.shield import FORCE_RAMP_N, described, limits_of, widened
 
 POLICY = invented.small_policy()
 TASK = invented.TASK
@@ -72,6 +72,28 @@ def test_where_nobody_has_been_the_reference_policy_acts(column: int) -> None:
     action, activity = said(shielded(), seen, means)
     np.testing.assert_array_equal(activity, 1.0)
     np.testing.assert_allclose(action, means, atol=1e-6)
+
+
+def test_where_the_reference_policy_alone_has_been_the_filter_acts_too_but_not_at_its_forces() -> None:
+    def with_(column: int, value: float) -> Trajectory:
+        seen = REFERENCE[0].observations.copy()
+        seen[:, column] = value
+        return replace(REFERENCE[0], observations=seen)
+
+    low, high = limits()["observation_low"], limits()["observation_high"]
+    further = [with_(0, high[0] + 1.0), with_(8, low[8] - 1.0), with_(FORCE, high[FORCE] + 1.0)]
+    wide = widened(limits(), TASK.observation, further)
+    assert (wide["observation_high"][0], wide["observation_low"][8]) == (high[0] + 1.0, low[8] - 1.0)
+    for end in ("low", "high", "ramp"):
+        assert wide[f"observation_{end}"][FORCE] == limits()[f"observation_{end}"][FORCE]
+    for name in limits().keys() - {"observation_low", "observation_high", "observation_ramp"}:
+        np.testing.assert_array_equal(wide[name], limits()[name])
+    seen = far_out(0, high[0] + 1.0)
+    seen[:, FORCE] = 0.0
+    narrow, further_on = (said(replace(BARE, shield=each), seen, POLICY.mean(seen))[1] for each in (limits(), wide))
+    assert (further_on <= narrow + 1e-6).all()
+    assert np.mean(narrow > 0.1) == 1.0
+    assert np.mean(further_on < 1e-6) > 0.5
 
 
 def test_what_has_never_been_done_is_not_done() -> None:

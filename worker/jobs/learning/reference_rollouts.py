@@ -46,10 +46,11 @@ def make_ready(
 
 
 def reference_blocks(task: str, settings: StudySettings) -> list[range]:
-    """The scenarios in which filters of such a study are compared with the reference policy."""
-    config = filter_config(settings)
-    gate = [config.gate_block(registry.task(task))] if settings.method is Method.STUDIO else []
-    return [*gate, first_of(EVALUATION, config.evaluation_scenarios)]
+    """The scenarios in which filters of such a study are compared with the reference policy, or it is driven alone."""
+    config, description = filter_config(settings), registry.task(task)
+    blocks = [config.gate_block(description), config.home_block(description)]
+    made = blocks if settings.method is Method.STUDIO else []
+    return [*made, first_of(EVALUATION, config.evaluation_scenarios)]
 
 
 def promise_block(settings: StudySettings, study_seed: int) -> range:

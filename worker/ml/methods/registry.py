@@ -149,7 +149,7 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's quick filter: mode, gate, residual encoder, gate."""
-    return _shipped(setting.problem, _fitted(setting))
+    return _shipped(setting, _fitted(setting))
 
 
 def fit_without(setting: Setting, **changed: Any) -> tuple[Act, tuple[str, ...]]:
@@ -177,7 +177,7 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
             drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
             return gate_refined(problem, drafts, reference, more_reference, setting.collect)
 
-        return _shipped(problem, _fitted(setting, refined))
+        return _shipped(setting, _fitted(setting, refined))
 
 
 def fit_as_printed(setting: Setting, list_length: int) -> tuple[Act, tuple[str, ...]]:
@@ -340,8 +340,10 @@ def _fitted(setting: Setting, refined: Callable[[FilterDraft], FilterDraft] = la
     return pbarl.fit_studio(setting.problem, surface, setting.pool, gate, setting.collect, refined=refined)
 
 
-def _shipped(problem: FilterProblem, draft: FilterDraft) -> tuple[Act, tuple[str, ...]]:
-    draft = draft.shielded()
+def _shipped(setting: Setting, draft: FilterDraft) -> tuple[Act, tuple[str, ...]]:
+    problem = setting.problem
+    home = partial(setting.reference, problem.config.home_block(problem.task))
+    draft = draft.shielded(problem.task.observation, home)
     weights = draft.weights
     mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
     share = weights.residual_share if weights.encoder else 0.0

@@ -98,6 +98,24 @@ def limits_of(
     return {**limits, **touch_limits(observation, reference)}
 
 
+def widened(
+    limits: Mapping[str, Float32Array], observation: Space, reference: Sequence[Trajectory]
+) -> dict[str, Float32Array]:
+    """The same, but the observation as far as these rollouts of the reference policy have stayed within, too.
+
+    How somebody sits is no filter's doing, and a gate's few scenarios show little of it. The force stays as it is.
+    """
+    seen = _box("observation", observation, np.concatenate([each.observations[:-1] for each in reference]))
+    force = [place for field, place in observation.slices() if field.name == FORCE]
+    found = dict(limits)
+    for end, further in (("low", np.minimum), ("high", np.maximum), ("ramp", np.maximum)):
+        name = f"observation_{end}"
+        found[name] = further(limits[name], seen[name])
+        for place in force:
+            found[name][place] = limits[name][place]
+    return found
+
+
 def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
     """Limits that nothing leaves, for tracing; without NAMES those of a filter whose touches cannot be foretold."""
     sizes = {"observation": observation.size, "change": action_size}

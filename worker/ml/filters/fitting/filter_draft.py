@@ -3,14 +3,17 @@
 import io
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 
+from worker.domain.spaces import Space
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Float32Array
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import widened
 
 _VALUE, _TESTED = "value/", "tested/"
 
@@ -46,7 +49,7 @@ class FilterDraft:
     notes: tuple[str, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     tested: Mapping[str, Float32Array] = field(default_factory=dict)
-    """what the filter stayed within when it was tried (shield.limits_of)"""
+    """what the filter stayed within when it was tried (shield.limits_of); limits of its shield, once it has one"""
     promise: Mapping[str, Any] = field(default_factory=dict)
     """a Promise (worker.analysis.filters.promise) and the tests that earned it, as plain values; empty: none"""
     choice: Mapping[str, float] = field(default_factory=dict)
@@ -57,9 +60,13 @@ class FilterDraft:
         spent = self.seconds.get(stage, 0.0) + time.perf_counter() - started
         return replace(self, seconds={**self.seconds, stage: round(spent, 3)})
 
-    def shielded(self) -> Self:
-        """The same with a shield around what was tested."""
-        return replace(self, weights=self.weights.changed(shield=self.tested))
+    def shielded(self, observation: Space, reference: Callable[[], Sequence[Trajectory]]) -> Self:
+        """The same with a shield around what was tested, and around where the reference policy alone has been.
+
+        ``reference``: its rollouts, asked for where there is something to shield.
+        """
+        tested = widened(self.tested, observation, reference()) if self.tested else {}
+        return replace(self, tested=tested, weights=self.weights.changed(shield=tested))
 
     def to_bytes(self) -> bytes:
         """One .npz file of plain arrays."""

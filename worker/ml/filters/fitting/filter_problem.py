@@ -33,7 +33,7 @@ class Collect(Protocol):
         ...
 
 
-CHECK_FROM, WATCH_FROM = 10_000, 20_000
+CHECK_FROM, WATCH_FROM, HOME_FROM = 10_000, 20_000, 30_000
 """of the gate's scenarios; the ones before are those of a gate, however many that has"""
 USUAL_STEPS = 100
 """Control steps of an episode, in which the counts of episodes below are meant."""
@@ -57,6 +57,8 @@ class FilterConfig:
     """of USUAL_STEPS control steps, in which a refined policy is tried once more; see check_block()"""
     watch_scenarios: int = 200
     """of USUAL_STEPS control steps, in which a policy is tried while it is refined; see watch_block()"""
+    home_scenarios: int = 160
+    """of USUAL_STEPS control steps, in which the reference policy alone is driven; see home_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
@@ -94,6 +96,10 @@ class FilterConfig:
     def watch_block(self, task: Task) -> range:
         """Scenarios in which a policy that is being refined is tried, again and again."""
         return first_of(GATE, _affordable(self.watch_scenarios, task), skip=WATCH_FROM)
+
+    def home_block(self, task: Task) -> range:
+        """Scenarios that show a shield where the reference policy is at home."""
+        return first_of(GATE, _affordable(self.home_scenarios, task), skip=HOME_FROM)
 
     def residual_block(self, task: Task, number: int) -> range:
         """Scenarios in which the filter is rolled out before round ``number`` of residual learning."""
