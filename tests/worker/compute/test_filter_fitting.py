@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from tests.worker import invented
 from tests.worker.at_hand import AtHand
+from worker.analysis.filters.promise import Outcome
 from worker.compute import filter_finishing, filter_fitting, learning
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.policies.checkpoint import Checkpoint
@@ -74,6 +77,41 @@ class Drives(AtHand):
         assert function is learning.run_scenarios
         self.scenarios.update(*(scenarios for _, _, scenarios, *_ in arguments))
         return [[] for _ in arguments]
+
+
+class AtHome(AtHand):
+    """Episodes of noise, of the reference policy in the scenarios of its home; nobody is ever harmed."""
+
+    HOME = FilterConfig().home_block(invented.TASK)
+
+    def run_all(self, lane: Lane, beat: Callable[[], None], function: Any, arguments: list[tuple[Any, ...]]) -> Any:
+        """See Compute."""
+        if function is learning.outcomes:
+            return [[Outcome(0.0, 0.0, True)] * len(scenarios) for _, _, scenarios in arguments]
+        assert {scenario for _, _, scenarios, *_ in arguments for scenario in scenarios} == set(self.HOME)
+        return [[self.episode(scenario) for scenario in scenarios] for _, _, scenarios, *_ in arguments]
+
+    @staticmethod
+    def episode(scenario: int) -> Trajectory:
+        """The same again in the same scenario."""
+        return invented.trajectory(np.random.default_rng(scenario), scenario=scenario)
+
+
+def test_a_shield_reaches_as_far_as_the_reference_policy_has_been_in_scenarios_that_no_filter_is_tried_in() -> None:
+    few = [AtHome.episode(scenario) for scenario in FilterConfig().gate_block(invented.TASK)[:2]]
+    tested = limits_of(invented.TASK.observation, invented.TASK.action, few, few)
+    reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
+    fit = FilterFit("feeding", AtHome(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
+    kept = fit.keep_promise(FilterDraft(FilterWeights(mode={"press": 0.5}), tested=tested))
+    assert kept.promise["tests"][-1]["earned"]
+    seen = np.concatenate([AtHome.episode(scenario).observations[:-1] for scenario in AtHome.HOME])
+    force = invented.TASK.observation.slice_of("force_on_person_n").start
+    others = np.arange(seen.shape[1]) != force
+    low, high = kept.weights.shield["observation_low"], kept.weights.shield["observation_high"]
+    assert (seen[:, others] >= low[others]).all()
+    assert (seen[:, others] <= high[others]).all()
+    assert (seen[:, others] > tested["observation_high"][others]).any()
+    assert high[force] == tested["observation_high"][force] < seen[:, force].max()
 
 
 @pytest.mark.parametrize(("ahead", "tried"), [(True, False), (False, True)])
