@@ -86,6 +86,7 @@ def due(monkeypatch: pytest.MonkeyPatch, job: Job) -> Job:
     monkeypatch.setattr(reconcile, "RETRY_AFTER", timedelta(seconds=0.2))
     monkeypatch.setattr(service, "LOOK_AGAIN_S", 0.2)
     monkeypatch.setattr(service, "REST", 0.0)
+    monkeypatch.setattr(engine, "POLL_S", 0.1)
     return job
 
 
