@@ -104,14 +104,10 @@ def test_a_shield_reaches_as_far_as_the_reference_policy_has_been_in_scenarios_t
     fit = FilterFit("feeding", AtHome(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
     kept = fit.keep_promise(FilterDraft(FilterWeights(mode={"press": 0.5}), tested=tested))
     assert kept.promise["tests"][-1]["earned"]
-    seen = np.concatenate([AtHome.episode(scenario).observations[:-1] for scenario in AtHome.HOME])
-    force = invented.TASK.observation.slice_of("force_on_person_n").start
-    others = np.arange(seen.shape[1]) != force
-    low, high = kept.weights.shield["observation_low"], kept.weights.shield["observation_high"]
-    assert (seen[:, others] >= low[others]).all()
-    assert (seen[:, others] <= high[others]).all()
-    assert (seen[:, others] > tested["observation_high"][others]).any()
-    assert high[force] == tested["observation_high"][force] < seen[:, force].max()
+    seen = np.concatenate([AtHome.episode(scenario).observations for scenario in AtHome.HOME])
+    assert (seen >= kept.weights.shield["observation_low"]).all()
+    assert (seen <= kept.weights.shield["observation_high"]).all()
+    assert (seen.max(axis=0) > tested["observation_high"]).all()
 
 
 @pytest.mark.parametrize(("ahead", "tried"), [(True, False), (False, True)])

@@ -74,18 +74,17 @@ def test_where_nobody_has_been_the_reference_policy_acts(column: int) -> None:
     np.testing.assert_allclose(action, means, atol=1e-6)
 
 
-def test_where_the_reference_policy_alone_has_been_the_filter_acts_too_but_not_at_its_forces() -> None:
+def test_where_the_reference_policy_alone_has_been_the_filter_acts_too() -> None:
     def with_(column: int, value: float) -> Trajectory:
         seen = REFERENCE[0].observations.copy()
         seen[:, column] = value
         return replace(REFERENCE[0], observations=seen)
 
     low, high = limits()["observation_low"], limits()["observation_high"]
-    further = [with_(0, high[0] + 1.0), with_(8, low[8] - 1.0), with_(FORCE, high[FORCE] + 1.0)]
+    further = [with_(0, high[0] + 1.0), with_(8, low[8] - 1.0), with_(FORCE, high[FORCE] + 9.0)]
     wide = widened(limits(), TASK.observation, further)
     assert (wide["observation_high"][0], wide["observation_low"][8]) == (high[0] + 1.0, low[8] - 1.0)
-    for end in ("low", "high", "ramp"):
-        assert wide[f"observation_{end}"][FORCE] == limits()[f"observation_{end}"][FORCE]
+    assert (wide["observation_high"][FORCE], wide["observation_ramp"][FORCE]) == (high[FORCE] + 9.0, FORCE_RAMP_N)
     for name in limits().keys() - {"observation_low", "observation_high", "observation_ramp"}:
         np.testing.assert_array_equal(wide[name], limits()[name])
     seen = far_out(0, high[0] + 1.0)

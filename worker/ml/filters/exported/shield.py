@@ -103,17 +103,20 @@ def widened(
 ) -> dict[str, Float32Array]:
     """The same, but the observation as far as these rollouts of the reference policy have stayed within, too.
 
-    How somebody sits is no filter's doing, and a gate's few scenarios show little of it. The force stays as it is.
+    How somebody sits is no filter's doing, and a gate's few scenarios show little of it. Nor do they show how hard the
+    reference policy presses at worst, to which nobody should be returned because of less (decision 180).
     """
-    seen = _box("observation", observation, np.concatenate([each.observations[:-1] for each in reference]))
-    force = [place for field, place in observation.slices() if field.name == FORCE]
-    found = dict(limits)
-    for end, further in (("low", np.minimum), ("high", np.maximum), ("ramp", np.maximum)):
-        name = f"observation_{end}"
-        found[name] = further(limits[name], seen[name])
-        for place in force:
-            found[name][place] = limits[name][place]
-    return found
+    seen = _box("observation", observation, np.concatenate([each.observations for each in reference]))
+    ramp = np.maximum(limits["observation_ramp"], seen["observation_ramp"])
+    for field, place in observation.slices():
+        if field.name == FORCE:
+            ramp[place] = FORCE_RAMP_N
+    return {
+        **limits,
+        "observation_low": np.minimum(limits["observation_low"], seen["observation_low"]),
+        "observation_high": np.maximum(limits["observation_high"], seen["observation_high"]),
+        "observation_ramp": ramp,
+    }
 
 
 def widest(observation: Space, action_size: int) -> dict[str, Float32Array]:
