@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
@@ -113,8 +114,9 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     """What is learned with rollouts."""
     setting = bench.setting()
     gate = setting.reference(FILTER.gate_block(bench.task))
-    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, setting.collect)
-    draft = draft.shielded(bench.task.observation, lambda: setting.reference(FILTER.home_block(bench.task)))
+    home = partial(setting.reference, FILTER.home_block(bench.task))
+    draft = pbarl.fit_studio(setting.problem, setting.surface(), setting.pool, gate, home, setting.collect)
+    draft = draft.shielded(bench.task.observation, home)
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
     beginning = Beginning(setting.make_env, setting.pool, gate, gate, setting.collect)

@@ -96,7 +96,8 @@ class FilterFit:
     def gate_residual(self, draft: FilterDraft) -> FilterDraft:
         """As much of the residual as held-out scenarios allow."""
         reference = self._gate_reference()
-        return residual.gate_residual(self.problem, draft, reference, self.collect, self.progress)
+        home = self._home_reference
+        return residual.gate_residual(self.problem, draft, reference, home, self.collect, self.progress)
 
     def refine(
         self,

@@ -335,15 +335,18 @@ def _gate(setting: Setting) -> range:
     return setting.problem.config.gate_block(setting.problem.task)
 
 
+def _home(setting: Setting) -> Callable[[], Sequence[Trajectory]]:
+    return partial(setting.reference, setting.problem.config.home_block(setting.problem.task))
+
+
 def _fitted(setting: Setting, refined: Callable[[FilterDraft], FilterDraft] = lambda mode: mode) -> FilterDraft:
-    gate, surface = setting.reference(_gate(setting)), setting.surface()
-    return pbarl.fit_studio(setting.problem, surface, setting.pool, gate, setting.collect, refined=refined)
+    gate, home, surface = setting.reference(_gate(setting)), _home(setting), setting.surface()
+    return pbarl.fit_studio(setting.problem, surface, setting.pool, gate, home, setting.collect, refined=refined)
 
 
 def _shipped(setting: Setting, draft: FilterDraft) -> tuple[Act, tuple[str, ...]]:
     problem = setting.problem
-    home = partial(setting.reference, problem.config.home_block(problem.task))
-    draft = draft.shielded(problem.task.observation, home)
+    draft = draft.shielded(problem.task.observation, _home(setting))
     weights = draft.weights
     mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
     share = weights.residual_share if weights.encoder else 0.0

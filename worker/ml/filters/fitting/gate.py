@@ -1,6 +1,7 @@
 """Trying a filter on held-out scenarios, and what makes it acceptable: better for the person, task and forces kept."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -10,6 +11,8 @@ from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 
+DOUBTED = 3
+"""Scenarios more than accepted in which a filter may fail, and be tried in others."""
 PRIOR = 4.0
 """scenarios in which only one of two policies fails, two of them either, that are imagined before any was driven"""
 
@@ -90,6 +93,19 @@ def keeps_task(problem: FilterProblem, trial: GateTrial, reference: Sequence[Tra
     config = problem.config
     gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
     return trial.success_change >= -config.success_tolerance and gentle
+
+
+def is_doubtful(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
+    """Whether it fails in so few scenarios more than is accepted that others may show that it does not, forces kept."""
+    tolerated = problem.config.success_tolerance + DOUBTED / len(reference)
+    problem = replace(problem, config=replace(problem.config, success_tolerance=tolerated))
+    return keeps_task(problem, trial, reference)
+
+
+def pooled(trial: GateTrial, scenarios: int, again: GateTrial, others: int) -> GateTrial:
+    """The same trial with its success and forces in two sets of scenarios, of these sizes."""
+    success = (scenarios * trial.success_change + others * again.success_change) / (scenarios + others)
+    return replace(trial, success_change=success, p95_force_n=max(trial.p95_force_n, again.p95_force_n))
 
 
 def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Trajectory]) -> float:

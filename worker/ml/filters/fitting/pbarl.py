@@ -19,15 +19,16 @@ def fit_studio(
     surface: ResponseSurface,
     pool: Sequence[Trajectory],
     reference: Sequence[Trajectory],
+    more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
     refined: Callable[[FilterDraft], FilterDraft] = lambda mode: mode,
 ) -> FilterDraft:
     """All stages in a row, without shield.
 
-    ``reference``: of the reference policy on the problem's gate scenarios; ``refined``: gives the draft a refined
-    policy, if that is better than the mode; no residual is needed then.
+    ``reference``, ``more_reference``: of the reference policy on the problem's gate and home scenarios; ``refined``:
+    gives the draft a refined policy, if that is better than the mode; no residual is needed then.
     """
     draft = refined(find_mode(problem, surface, pool, reference, collect, progress))
     draft = train_residual(problem, draft, collect, progress)
-    return gate_residual(problem, draft, reference, collect, progress)
+    return gate_residual(problem, draft, reference, more_reference, collect, progress)
