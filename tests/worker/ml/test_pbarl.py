@@ -273,7 +273,7 @@ def test_a_residual_has_to_be_better_than_the_mode_though_a_refinement_was_refus
 
 
 @pytest.mark.parametrize(
-    ("slowest", "tried", "kept"), [(0.0, [1.0, 1.5, 2.0], 2.0), (0.019, [1.0, 1.5], 1.0), (0.021, [1.0, 1.0, 0.5], 0.5)]
+    ("slowest", "tried", "kept"), [(0.0, [1.0, 1.5, 2.0], 2.0), (0.019, [1.0, 1.5], 1.0), (0.021, [1.0, 0.5], 0.5)]
 )
 def test_more_of_a_residual_than_was_learned_is_kept_while_it_is_better_and_nothing_more_fails(
     slowest: float, tried: list[float], kept: float, reference: list[Trajectory]
@@ -302,20 +302,20 @@ class Timed(World):
 
 @pytest.mark.parametrize(
     ("fails_in", "others", "kept"),
-    [([0], 40, 1.0), ([0], 12, 0.5), ([0, 6, 7], 60, 0.5), ([0, 1, 2, 3], 600, 0.5)],
+    [([0], 40, 1.0), ([0, 6], 40, 1.0), ([0, 6, 7, 8, 9], 40, 0.5), ([0, 1], 40, 0.5)],
 )
-def test_what_fails_a_little_too_often_is_tried_in_more_scenarios_and_judged_by_all_of_them(
+def test_what_fails_a_little_too_often_is_tried_in_other_scenarios_and_has_to_do_better_there(
     fails_in: list[int], others: int, kept: float, reference: list[Trajectory]
 ) -> None:
-    """The whole of a residual fails in some of six scenarios and of so many others; 3.5 % are accepted."""
-    asked = problem(-1.0, reference)
+    """The whole of a residual fails in some of six scenarios and of forty others; a tenth are accepted."""
+    asked = problem(-1.0, reference, success_tolerance=0.1)
     scenarios = first_of(GATE, 6 + others)
     learned = learn_round(asked, FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)])
     world = Timed([scenarios[place] for place in fails_in])
     more = World().collect(POLICY.mean, scenarios[6:], 0.0, 0)
     gated = residual.gate_residual(asked, learned, reference, lambda: more, world.collect)
     assert gated.weights.residual_share == kept
-    assert (others in world.asked) == (len(fails_in) < 4)
+    assert (others in world.asked) == (1 not in fails_in)
 
 
 def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surface: ResponseSurface) -> None:

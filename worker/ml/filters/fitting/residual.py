@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from worker.ml.filters.exported.filter_module import ModeTransform, load_state, 
 from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import is_doubtful, keeps_task, pooled, to_beat, try_on
+from worker.ml.filters.fitting.gate import keeps_task, keeps_task_after_all, to_beat, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
@@ -125,20 +126,16 @@ def gate_residual(
         trials.append(trial)
         return trial, driven
 
-    def keeps_task_after_all(trial: GateTrial) -> bool:
-        """Whether it is shown so by more scenarios, where so few do not say."""
-        if not is_doubtful(problem, trial, reference):
-            return False
-        further = more_reference()
-        again, _ = tried(trial.residual_share, further)
-        return keeps_task(problem, pooled(trial, len(reference), again, len(further)), reference)
+    def in_others(share: float) -> GateTrial:
+        return tried(share, more_reference())[0]
 
     alone = to_beat(problem, draft, reference)
     kept: GateTrial | None = None
     stayed: Sequence[Trajectory] = ()
     for share in config.residual_shares:
         trial, driven = tried(share, reference)
-        if trial.preference > alone and (keeps_task(problem, trial, reference) or keeps_task_after_all(trial)):
+        again = partial(in_others, share)
+        if trial.preference > alone and keeps_task_after_all(problem, trial, reference, again):
             kept, stayed = trial, driven
             break
     if kept and kept.residual_share == 1.0 and keeps_task(problem, kept, reference):
