@@ -39,10 +39,10 @@ CONFIG = FilterConfig(
 
 
 class World:
-    """Observations are noise; an episode fails when it is slower than ``slowest``."""
+    """Observations are noise; an episode fails when it is slower than ``slowest``, and presses with ``force_n``."""
 
-    def __init__(self, slowest: float = -np.inf) -> None:
-        self.slowest = slowest
+    def __init__(self, slowest: float = -np.inf, force_n: float = 0.0) -> None:
+        self.slowest, self.force_n = slowest, force_n
         self.asked: list[int] = []
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -58,7 +58,9 @@ class World:
         signals[:, SPEED] = (actions**2).mean(axis=1)
         episode = invented.trajectory(rng, steps=STEPS, scenario=scenario, signals=signals, actions=actions)
         success = bool(signals[:, SPEED].mean() >= self.slowest)
-        return replace(episode, observations=seen, reference_actions=POLICY.mean(seen[:-1]), success=success)
+        forces = np.full_like(episode.contact_force_n, self.force_n)
+        episode = replace(episode, contact_force_n=forces, success=success)
+        return replace(episode, observations=seen, reference_actions=POLICY.mean(seen[:-1]))
 
 
 def reward(weight: float) -> StructuredReward:
@@ -273,15 +275,21 @@ def test_a_residual_has_to_be_better_than_the_mode_though_a_refinement_was_refus
 
 
 @pytest.mark.parametrize(
-    ("slowest", "tried", "kept"), [(0.0, [1.0, 1.5, 2.0], 2.0), (0.019, [1.0, 1.5], 1.0), (0.021, [1.0, 0.5], 0.5)]
+    ("slowest", "force_n", "tried", "kept"),
+    [
+        (0.0, 0.0, [1.0, 1.5, 2.0, 3.0], 2.0),
+        (0.0, 0.1, [1.0, 1.5, 2.0], 1.5),
+        (0.019, 0.0, [1.0, 1.5], 1.0),
+        (0.021, 0.0, [1.0, 0.5], 0.5),
+    ],
 )
 def test_more_of_a_residual_than_was_learned_is_kept_while_it_is_better_and_nothing_more_fails(
-    slowest: float, tried: list[float], kept: float, reference: list[Trajectory]
+    slowest: float, force_n: float, tried: list[float], kept: float, reference: list[Trajectory]
 ) -> None:
-    """For somebody who dislikes speed, where whatever is slower than ``slowest`` fails."""
-    asked = problem(-1.0, reference)
+    """For somebody who dislikes speed, where whatever is slower than ``slowest`` fails, and whatever acts presses."""
+    asked = problem(-1.0, reference, residual_gentle=1.5)
     learned = learn_round(asked, FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)])
-    gated = residual.gate_residual(asked, learned, reference, lambda: reference, World(slowest).collect)
+    gated = residual.gate_residual(asked, learned, reference, lambda: reference, World(slowest, force_n).collect)
     assert [each.residual_share for each in gated.trials] == tried
     assert gated.weights.residual_share == kept
 

@@ -117,5 +117,10 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
     return trial.preference if trial and acceptable(problem, trial, reference) else 0.0
 
 
+def largest_force_n(trajectories: Sequence[Trajectory]) -> float:
+    """On the person, in any of them."""
+    return float(max(each.contact_force_n.max() for each in trajectories))
+
+
 def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:
     return float(np.quantile([each.contact_force_n.max() for each in trajectories], 0.95))

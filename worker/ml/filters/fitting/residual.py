@@ -19,7 +19,7 @@ from worker.ml.filters.exported.filter_module import ModeTransform, load_state, 
 from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import keeps_task, keeps_task_after_all, to_beat, try_on
+from worker.ml.filters.fitting.gate import keeps_task, keeps_task_after_all, largest_force_n, to_beat, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
@@ -119,7 +119,7 @@ def gate_residual(
 
     def tried(share: float, beside: Sequence[Trajectory]) -> tuple[GateTrial, Sequence[Trajectory]]:
         """What came of so much of it, and the rollouts."""
-        progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.03 * len(trials))
+        progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.02 * len(trials))
         weights = draft.weights.changed(residual_share=share)
         act = act_of(problem.task.modes, problem.policy, weights)
         trial, driven = try_on(problem, act, weights.gate, share, beside, collect)
@@ -142,7 +142,8 @@ def gate_residual(
         for share in config.residual_beyond:
             trial, driven = tried(share, reference)
             better = trial.preference > kept.preference and trial.success_change >= kept.success_change
-            if not (better and keeps_task(problem, trial, reference)):
+            gentle = share <= config.residual_gentle or largest_force_n(driven) <= largest_force_n(reference)
+            if not (better and gentle and keeps_task(problem, trial, reference)):
                 break
             kept, stayed = trial, driven
     weights = draft.weights.changed(residual_share=kept.residual_share if kept else 0.0)
