@@ -310,7 +310,7 @@ class Timed(World):
 
 @pytest.mark.parametrize(
     ("fails_in", "others", "kept"),
-    [([0], 40, 1.0), ([0, 6], 40, 1.0), ([0, 6, 7, 8, 9], 40, 0.5), ([0, 1], 40, 0.5)],
+    [([0], 40, 2.0), ([0, 6], 40, 2.0), ([0, 6, 7, 8, 9], 40, 0.5), ([0, 1], 40, 0.5)],
 )
 def test_what_fails_a_little_too_often_is_tried_in_other_scenarios_and_has_to_do_better_there(
     fails_in: list[int], others: int, kept: float, reference: list[Trajectory]

@@ -119,7 +119,7 @@ def gate_residual(
 
     def tried(share: float, beside: Sequence[Trajectory]) -> tuple[GateTrial, Sequence[Trajectory]]:
         """What came of so much of it, and the rollouts."""
-        progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.02 * len(trials))
+        progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.01 * len(trials))
         weights = draft.weights.changed(residual_share=share)
         act = act_of(problem.task.modes, problem.policy, weights)
         trial, driven = try_on(problem, act, weights.gate, share, beside, collect)
@@ -138,12 +138,13 @@ def gate_residual(
         if trial.preference > alone and keeps_task_after_all(problem, trial, reference, again):
             kept, stayed = trial, driven
             break
-    if kept and kept.residual_share == 1.0 and keeps_task(problem, kept, reference):
+    if kept and kept.residual_share == 1.0:
         for share in config.residual_beyond:
             trial, driven = tried(share, reference)
-            better = trial.preference > kept.preference and trial.success_change >= kept.success_change
             gentle = share <= config.residual_gentle or largest_force_n(driven) <= largest_force_n(reference)
-            if not (better and gentle and keeps_task(problem, trial, reference)):
+            if not (trial.preference > kept.preference and gentle):
+                break
+            if not keeps_task_after_all(problem, trial, reference, partial(in_others, share), kept):
                 break
             kept, stayed = trial, driven
     weights = draft.weights.changed(residual_share=kept.residual_share if kept else 0.0)
