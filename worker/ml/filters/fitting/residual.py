@@ -19,7 +19,7 @@ from worker.ml.filters.exported.filter_module import ModeTransform, load_state, 
 from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import keeps_task, keeps_task_after_all, largest_force_n, to_beat, try_on
+from worker.ml.filters.fitting.gate import keeps_task_after_all, largest_force_n, to_beat, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
