@@ -18,7 +18,7 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting import mode_search, pbarl, residual, response_surface
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
-from worker.ml.filters.fitting.gate import trial_of, try_on
+from worker.ml.filters.fitting.gate import keeps_task_after_all, trial_of, try_on
 from worker.ml.filters.fitting.residual import learn_round
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
@@ -324,6 +324,25 @@ def test_what_fails_a_little_too_often_is_tried_in_other_scenarios_and_has_to_do
     gated = residual.gate_residual(asked, learned, reference, lambda: more, world.collect)
     assert gated.weights.residual_share == kept
     assert (others in world.asked) == (1 not in fails_in)
+
+
+@pytest.mark.parametrize(
+    ("doubted", "more_often", "again"), [(False, False, False), (False, True, True), (True, False, True)]
+)
+def test_what_follows_what_was_doubted_or_fails_more_often_is_tried_in_other_scenarios(
+    doubted: bool, more_often: bool, again: bool, reference: list[Trajectory]
+) -> None:
+    asked = problem(-1.0, reference)
+    earlier = GateTrial(1.0, 1.0, 1.0, -0.05 if doubted else -0.01, 0.0)
+    trial = replace(earlier, residual_share=1.5, success_change=-0.02 if more_often else -0.01)
+    asked_for = list[GateTrial]()
+
+    def fails() -> GateTrial:
+        asked_for.append(trial)
+        return replace(trial, success_change=-0.03)
+
+    assert keeps_task_after_all(asked, trial, reference, fails, earlier) == (not again)
+    assert bool(asked_for) == again
 
 
 def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surface: ResponseSurface) -> None:
