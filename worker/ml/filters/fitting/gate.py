@@ -105,8 +105,7 @@ def keeps_task_after_all(
 ) -> bool:
     """Whether it keeps the task where it was tried, or comes close and clearly keeps it in other scenarios.
 
-    ``again``: tries it there; ``earlier``: what fails more often than this, or follows what was doubted, is tried there,
-    too.
+    ``again``: tries it there, as is what fails more often than ``earlier``, or follows it although it was doubted.
     Three failures in 80 scenarios are refused, and a filter that fails in two of a hundred has as many in one of five
     cases; with 160 others it is refused in one of twenty. One that fails in five of a hundred passes in 28 cases of a
     hundred instead of 23 (decision 181).
