@@ -103,7 +103,8 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         study_seed=number,
         version=len(PAPER_PROTOCOL.milestones),
     )
-    fit._gate_reference(), fit._home_reference()  # of which a worker has made sure beforehand
+    fit._gate_reference()  # of both of which a worker has made sure beforehand
+    fit._home_reference()
     started = time.process_time()
     draft = fit.gate_residual(fit.train_residual(_refined(fit, fit.find_mode(bench.pool), bench.pool)))
     fitted = time.process_time()

@@ -58,7 +58,7 @@ class FilterConfig:
     watch_scenarios: int = 200
     """of USUAL_STEPS control steps, in which a policy is tried while it is refined; see watch_block()"""
     home_scenarios: int = 160
-    """of USUAL_STEPS control steps, in which the reference policy alone is driven; see home_block()"""
+    """of USUAL_STEPS control steps, of the reference policy alone and of what was doubted; see home_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
@@ -100,7 +100,7 @@ class FilterConfig:
         return first_of(GATE, _affordable(self.watch_scenarios, task), skip=WATCH_FROM)
 
     def home_block(self, task: Task) -> range:
-        """Scenarios that show a shield where the reference policy is at home."""
+        """Scenarios that show where the reference policy is at home, and whether what was doubted keeps the task."""
         return first_of(GATE, _affordable(self.home_scenarios, task), skip=HOME_FROM)
 
     def residual_block(self, task: Task, number: int) -> range:
