@@ -113,6 +113,31 @@ def test_hints_are_given_that_are_true(scene: Scene) -> None:
     assert all(minded & set(each.less) for each in given)
 
 
+def test_what_is_called_equal_does_not_depend_on_how_few_clips_there_were_at_the_first_question(scene: Scene) -> None:
+    with scene.database.writing() as session:
+        study = factories.make_study(session, languages=("en",), clip_steps=STEPS)
+        participant, _ = factories.make_participant(session, study)
+    person = ScriptedPerson(scene.database, scene.store, study, TASTES["cautious"], Manner(mistakes=0.0), 0)
+
+    def filmed(numbers: range) -> list[Clip]:
+        with scene.database.writing() as session:
+            clips = [factories.make_clip(session, scene.store, study) for _ in numbers]
+            for number, clip in zip(numbers, clips, strict=True):
+                session.get_one(Rollout, clip.rollout_id).trajectory_sha256 = scene._noise(number)
+        return clips
+
+    def said(pairs: list[tuple[Clip, Clip]]) -> list[str]:
+        with scene.database.writing() as session:
+            asked = [factories.make_query(session, participant, *pair) for pair in pairs]
+        return [person.answer(query.id) for query in asked]
+
+    clips = filmed(range(2))
+    assert said([(clips[0], clips[1])])[0] in ("left", "right")
+    clips += filmed(range(2, 60))
+    answers = said(list(zip(clips[::2], clips[1::2], strict=True)))
+    assert answers.count("equal") == 3, "a tenth"
+
+
 def test_whatever_is_asked_is_answered_and_stored_as_it_was_meant(scene: Scene) -> None:
     evaluation = EvaluationSettings(
         methods=(REFERENCE, OWN),

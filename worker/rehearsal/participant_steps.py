@@ -7,7 +7,7 @@ has nothing to do with robots is answered at random.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from worker.rehearsal.browser import Offered
 from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
 
-CALIBRATION_PAIRS = 200
+CALIBRATION_PAIRS, FEWEST_PAIRS = 200, 15
 AGES = (18, 80)
 INDIFFERENT = 0.5
 """What a questionnaire is answered by that is about no robot, as a share of its range."""
@@ -81,6 +81,8 @@ class ScriptedPerson:
         self._taste, self._manner = taste, manner
         self._rng = np.random.default_rng(seed)
         self._teacher: ScriptedTeacher | None = None
+        self._calibrated_on = 0
+        """clips"""
         self._rater: ScriptedRater | None = None
         self.rated: list[Rated] = []
         """every trial, in the order in which it was rated"""
@@ -98,9 +100,8 @@ class ScriptedPerson:
                 other = {Response.LEFT: Response.RIGHT, Response.RIGHT: Response.LEFT}
                 return str((other[Response(query.expected)] if missed else Response(query.expected)).value)
             left, right = (self._rewards(clip) for clip in (query.left_clip, query.right_clip))
-            if self._teacher is None:
-                self._teacher = self._calibrated(session)
-        return self._teacher.answer(left, right, self._rng)
+            teacher = self._calibrated(session)
+        return teacher.answer(left, right, self._rng)
 
     def name_quality(self, query_id: int, answer: str) -> str:
         """What speaks most for the clip this user has chosen, by their true weights; nothing where they chose none."""
@@ -226,9 +227,14 @@ class ScriptedPerson:
         return np.stack([values[second] > values[first], foreseen > 0.5], axis=1)
 
     def _calibrated(self, session: Session) -> ScriptedTeacher:
-        pairs = dataset.matched_pairs(dataset.pool_clips(session, self._study_id))
-        rewards = [[self._rewards(clip) for clip in pair] for pair in pairs[:CALIBRATION_PAIRS]]
-        return ScriptedTeacher.calibrated(self._manner, np.array(rewards))
+        """What counts as equal by the clips there are: anew while more are filmed, and nothing while they are few."""
+        clips = dataset.pool_clips(session, self._study_id)
+        if self._teacher is None or len(clips) != self._calibrated_on:
+            pairs = dataset.matched_pairs(clips)[:CALIBRATION_PAIRS]
+            rewards = np.array([[self._rewards(clip) for clip in pair] for pair in pairs])
+            manner = self._manner if len(pairs) >= FEWEST_PAIRS else replace(self._manner, equal_share=0.0)
+            self._teacher, self._calibrated_on = ScriptedTeacher.calibrated(manner, rewards), len(clips)
+        return self._teacher
 
     def _rewards(self, clip: Clip) -> FloatArray:
         steps = slice(clip.first_step, clip.first_step + clip.step_count)
