@@ -42,6 +42,7 @@ from worker.sim.costs import preference_rewards, signal_weights
 from worker.tasks import registry
 
 CALIBRATION_PAIRS, FEWEST_PAIRS = 200, 15
+"""By so many pairs at most it is told which are alike, and by fewer than the second not at all."""
 AGES = (18, 80)
 INDIFFERENT = 0.5
 """What a questionnaire is answered by that is about no robot, as a share of its range."""

@@ -283,7 +283,7 @@ def test_a_residual_has_to_be_better_than_the_mode_though_a_refinement_was_refus
         (0.021, 0.0, [1.0, 0.5], 0.5),
     ],
 )
-def test_more_of_a_residual_than_was_learned_is_kept_while_it_is_better_and_nothing_more_fails(
+def test_more_of_a_residual_than_was_learned_is_kept_while_it_is_better_keeps_the_task_and_is_gentle(
     slowest: float, force_n: float, tried: list[float], kept: float, reference: list[Trajectory]
 ) -> None:
     """For somebody who dislikes speed, where whatever is slower than ``slowest`` fails, and whatever acts presses."""
