@@ -28,7 +28,7 @@ CALM, PRESSED = Outcome(2.0, 0.0, True), Outcome(99.0, 0.0, True)
 CASES = (
     ("at every strength as often as promised", (1.0,) * 4),
     ("a tenth more often", (1.1,) * 4),
-    ("twice, at 80 % and 60 % as often as promised, at 30 % half as often", (2.0, 1.0, 1.0, 0.5)),
+    ("twice, at 90 % and 80 % as often as promised, at 50 % half as often", (2.0, 1.0, 1.0, 0.5)),
     ("half as often", (0.5,) * 4),
     ("two fifths as often", (0.4,) * 4),
     ("a fifth as often", (0.2,) * 4),

@@ -81,7 +81,7 @@ def test_a_filter_that_harms_nobody_stays_as_it_is() -> None:
 
 def test_a_filter_that_harms_is_weakened_until_it_does_not() -> None:
     kept = draft_of((0.5, 0.0, 0.0, 0.0), 0)
-    assert kept.weights.gate == 0.8
+    assert kept.weights.gate == 0.9
     assert [test["earned"] for test in kept.promise["tests"]] == [False, True]
     assert kept.promise["tests"][0]["scenarios"] == BATCH, "what is lost is not driven any further"
 

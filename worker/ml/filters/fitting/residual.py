@@ -142,7 +142,7 @@ def gate_residual(
         for share in config.residual_beyond:
             trial, driven = tried(share, reference)
             gentle = share <= config.residual_gentle or largest_force_n(driven) <= largest_force_n(reference)
-            if not (trial.preference > kept.preference and gentle):
+            if not (trial.preference > config.residual_lift * kept.preference and gentle):
                 break
             if not keeps_task_after_all(problem, trial, reference, partial(in_others, share), kept):
                 break
