@@ -35,10 +35,12 @@ from worker.experiments.check_lab import checked
 from worker.jobs.clips.evaluation_films import make_films
 from worker.jobs.learning.baselines import train_method
 from worker.jobs.learning.filters import train_filter
+from worker.jobs.learning.reference_rollouts import reference_blocks
 from worker.jobs.learning.reward_models import train_reward
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.export import bundle
 from worker.ml.filters.fitting import policy_choice
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.policies import asked_policy
 from worker.ml.policies.onnx_policy import NotAPolicy, adapted
 from worker.tasks import registry
@@ -136,6 +138,18 @@ def test_a_study_asks_for_no_more_ways_than_there_are_policies_and_for_nothing_i
     assert said == {
         "following_share": "One of several policies is chosen in this task: nothing can be varied. Enter 0."
     }
+
+
+def test_where_there_is_nothing_to_shield_the_reference_policy_s_reach_is_not_found_out(
+    several: Path, use: Callable[[Path], None]
+) -> None:
+    config = FilterConfig()
+    use(several)
+    fit_response_surface.find_ranges("plane", scenarios=4)
+    choice, settings = registry.task("plane"), StudySettings(clip_steps=40)
+    made, home = reference_blocks("plane", settings), config.home_block(choice)
+    assert home not in made
+    assert config.gate_block(choice) in made
 
 
 def test_settings_stay_whatever_the_file_says_of_them_if_it_says_anything() -> None:

@@ -199,7 +199,10 @@ class FilterFit:
         return self.reference(self.problem.config.check_block(self.problem.task))
 
     def _home_reference(self) -> Sequence[Trajectory]:
-        return self.reference(self.problem.config.home_block(self.problem.task))
+        scenarios = self.problem.config.home_block(self.problem.task)
+        if (self.task, scenarios) not in self.references:
+            self.progress("driving the reference policy, whose reach the shield has to know", 0.85)
+        return self.reference(scenarios)
 
     def act_of(self, weights: FilterWeights) -> FilterAct:
         """The filter around its policy."""

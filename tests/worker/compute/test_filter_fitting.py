@@ -101,13 +101,20 @@ def test_a_shield_reaches_as_far_as_the_reference_policy_has_been_in_scenarios_t
     few = [AtHome.episode(scenario) for scenario in FilterConfig().gate_block(invented.TASK)[:2]]
     tested = limits_of(invented.TASK.observation, invented.TASK.action, few, few)
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
-    fit = FilterFit("feeding", AtHome(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
+    said = list[str]()
+    fit = FilterFit(
+        "feeding", AtHome(), lambda: None, reward, 0, FilterConfig(), lambda stage, _: said.append(stage), {}
+    )
     kept = fit.keep_promise(FilterDraft(FilterWeights(mode={"press": 0.5}), tested=tested))
     assert kept.promise["tests"][-1]["earned"]
     seen = np.concatenate([AtHome.episode(scenario).observations for scenario in AtHome.HOME])
     assert (seen >= kept.weights.shield["observation_low"]).all()
     assert (seen <= kept.weights.shield["observation_high"]).all()
     assert (seen > tested["observation_high"]).any()
+    assert "reach" in said[0]
+    said.clear()
+    fit.keep_promise(FilterDraft(FilterWeights(mode={"press": 0.5}), tested=tested))
+    assert not any("reach" in each for each in said), "what is known is not driven again"
 
 
 @pytest.mark.parametrize(("ahead", "tried"), [(True, False), (False, True)])

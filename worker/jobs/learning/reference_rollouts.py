@@ -6,6 +6,7 @@ from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
 from worker.compute.filter_fitting import CHUNK
 from worker.compute.pools import Computing, Lane
+from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import EVALUATION, first_of, of_promise
 from worker.domain.trajectory import Trajectory
 from worker.jobs.learning.fits import filter_config, promise_of
@@ -48,9 +49,12 @@ def make_ready(
 def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     """The scenarios in which filters of such a study are compared with the reference policy, or it is driven alone."""
     config, description = filter_config(settings), registry.task(task)
-    blocks = [config.gate_block(description), config.home_block(description)]
-    made = blocks if settings.method is Method.STUDIO else []
-    return [*made, first_of(EVALUATION, config.evaluation_scenarios)]
+    evaluation = first_of(EVALUATION, config.evaluation_scenarios)
+    if settings.method is not Method.STUDIO:
+        return [evaluation]
+    is_shielded = not isinstance(description.modes, PolicyChoice)  # whoever chooses among policies gets one as it is
+    home = [config.home_block(description)] if is_shielded else []
+    return [config.gate_block(description), *home, evaluation]
 
 
 def promise_block(settings: StudySettings, study_seed: int) -> range:

@@ -82,7 +82,7 @@ class FilterConfig:
     residual_shares: tuple[float, ...] = (1.0, 0.5)
     """tried in this order until one is acceptable and better than the mode alone"""
     residual_beyond: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0)
-    """tried in this order after the whole was kept, as long as each is clearly better than the last and keeps the task"""
+    """tried in this order after the whole was kept, as long as each is better than the last and keeps the task"""
     residual_lift: float = 1.03
     """times what the last one gained it has to gain: what fails a little more often is not worth it for less"""
     residual_gentle: float = 2.0
