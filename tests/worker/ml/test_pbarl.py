@@ -357,30 +357,6 @@ def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surf
     assert world.asked == searching.asked
 
 
-@pytest.mark.parametrize(
-    ("beyond", "of_the_step", "kept"),
-    [((1.5, 2.0), 0.95, 1.5), ((1.5, 2.0), 1.05, 1.0), ((1.05, 1.5), 1.05, 1.5)],
-)
-def test_a_step_up_that_gains_hardly_more_is_not_taken_but_two_that_together_gain_enough_are(
-    beyond: tuple[float, ...], of_the_step: float, kept: float, reference: list[Trajectory]
-) -> None:
-    """For somebody who dislikes speed, asked for a little less, or more, per step than half as much again gains."""
-    asked = problem(-1.0, reference, residual_beyond=beyond)
-    learned = learn_round(asked, FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)])
-
-    def gated(lift: float) -> FilterDraft:
-        config = replace(asked.config, residual_lift=lift)
-        return residual.gate_residual(
-            replace(asked, config=config), learned, reference, lambda: reference, World().collect
-        )
-
-    whole, more, _ = (each.preference for each in gated(0.0).trials)
-    step = more / whole - 1
-    asking = gated(1 + of_the_step * step)
-    assert [each.residual_share for each in asking.trials] == [1.0, *beyond]
-    assert asking.weights.residual_share == kept
-
-
 def test_learning_is_repeatable_and_later_rounds_go_on_from_earlier_ones(reference: list[Trajectory]) -> None:
     rollouts = World().collect(POLICY.mean, range(6), 0.3, 0)
     start = FilterDraft(FilterWeights(mode={"speed_far": -0.2}, gate=0.7))

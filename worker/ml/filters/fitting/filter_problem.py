@@ -83,8 +83,6 @@ class FilterConfig:
     """tried in this order until one is acceptable and better than the mode alone"""
     residual_beyond: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0)
     """tried in this order after the whole was kept, as long as each is better than the last and keeps the task"""
-    residual_lift: float = 1.03
-    """times what was kept gained it has to gain for every step up: less is not worth what fails a little more often"""
     residual_gentle: float = 2.0
     """more of it is kept only where nobody is touched harder than the reference policy touches anybody there"""
     evaluation_scenarios: int = 100

@@ -139,18 +139,14 @@ def gate_residual(
             kept, stayed = trial, driven
             break
     if kept and kept.residual_share == 1.0:
-        asked = 1.0
         for share in config.residual_beyond:
             trial, driven = tried(share, reference)
             gentle = share <= config.residual_gentle or largest_force_n(driven) <= largest_force_n(reference)
             if not (trial.preference > kept.preference and gentle):
                 break
-            asked *= config.residual_lift
-            if trial.preference < asked * kept.preference:
-                continue
             if not keeps_task_after_all(problem, trial, reference, partial(in_others, share), kept):
                 break
-            kept, stayed, asked = trial, driven, 1.0
+            kept, stayed = trial, driven
     weights = draft.weights.changed(residual_share=kept.residual_share if kept else 0.0)
     notes = draft.notes
     if kept is None:
