@@ -326,6 +326,30 @@ def test_what_fails_a_little_too_often_is_tried_in_other_scenarios_and_has_to_do
     assert (others in world.asked) == (1 not in fails_in)
 
 
+class Pressing(Timed):
+    """In these scenarios whoever takes much longer than the frozen policy succeeds, and presses with 6 N."""
+
+    def _episode(self, act: Act, scenario: int) -> Trajectory:
+        episode = super()._episode(act, scenario)
+        forces = np.full_like(episode.contact_force_n, 0.0 if episode.success else 6.0)
+        return replace(episode, contact_force_n=forces, success=True)
+
+
+@pytest.mark.parametrize(
+    ("pressed_in", "pressed_n", "kept"), [([0], 5.0, 2.0), ([0, 1, 2], 5.0, 0.5), ([0, 1, 2], 7.0, 2.0)]
+)
+def test_what_presses_much_harder_in_more_than_a_few_scenarios_is_not_kept(
+    pressed_in: list[int], pressed_n: float, kept: float, reference: list[Trajectory]
+) -> None:
+    asked = problem(-1.0, reference, pressed_n=pressed_n, pressed_tolerance=0.2)
+    scenarios = first_of(GATE, 6)
+    learned = learn_round(asked, FilterDraft(FilterWeights()), [World().collect(POLICY.mean, range(6), 0.3, 0)])
+    world = Pressing([scenarios[place] for place in pressed_in])
+    gated = residual.gate_residual(asked, learned, reference, no_more, world.collect)
+    assert gated.weights.residual_share == kept
+    assert gated.trials[0].pressed == pytest.approx(len(pressed_in) / 6 if pressed_n < 6.0 else 0.0)
+
+
 @pytest.mark.parametrize(
     ("doubted", "more_often", "again"), [(False, False, False), (False, True, True), (True, False, True)]
 )

@@ -50,7 +50,9 @@ def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:
 def filter_config(settings: StudySettings) -> FilterConfig:
     """What a study says about the fitting of its filters."""
     return FilterConfig(
-        success_tolerance=settings.success_tolerance, evaluation_scenarios=settings.evaluation_scenarios
+        success_tolerance=settings.success_tolerance,
+        pressed_n=settings.harm_force_n,
+        evaluation_scenarios=settings.evaluation_scenarios,
     )
 
 

@@ -35,6 +35,9 @@ class GateTrial:
     """whether it was the person's refined policy, in place of mode and residual"""
     chance: float | None = None
     """that it raises the return, as the members of the reward model see it; None: of an earlier version"""
+    pressed: float = 0.0
+    """share of episodes in which the largest force is FilterConfig.pressed_n above the reference's; 0: or of an earlier
+    version"""
 
 
 @dataclass(frozen=True)

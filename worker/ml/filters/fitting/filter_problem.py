@@ -63,6 +63,10 @@ class FilterConfig:
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
     force_limit_n: float = 10.0
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
+    pressed_n: float = 5.0
+    """of growth of an episode's largest force, from which on somebody counts as pressed; as the promise has it"""
+    pressed_tolerance: float = 0.035
+    """largest accepted share of the gate's episodes in which somebody is pressed"""
     residual_rounds: int = 3
     """of residual learning; 0 leaves the residual out"""
     residual_rollouts: int = 50

@@ -43,8 +43,16 @@ def trial_of(
     gains = np.average(after - before, axis=1, weights=_weights(outcomes))
     unit = max(float(before.mean(axis=0).std()), 1e-9)
     success = float(outcomes.mean())
-    force = _p95_force_n(filtered)
-    return GateTrial(gate, residual_share, float(gains.mean()) / unit, success, force, chance=chance_of_gain(gains))
+    pressed = float((_largest_forces(filtered) - _largest_forces(reference) > problem.config.pressed_n).mean())
+    return GateTrial(
+        gate,
+        residual_share,
+        float(gains.mean()) / unit,
+        success,
+        _p95_force_n(filtered),
+        chance=chance_of_gain(gains),
+        pressed=pressed,
+    )
 
 
 def _weights(outcomes: FloatArray) -> FloatArray:
@@ -90,10 +98,11 @@ def acceptable(problem: FilterProblem, trial: GateTrial, reference: Sequence[Tra
 def keeps_task(
     problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory], of_tolerance: float = 1.0
 ) -> bool:
-    """Whether success and forces stay within the tolerances, that of success so many times as wide."""
+    """Whether success and forces stay within the tolerances, those of shares of episodes so many times as wide."""
     config = problem.config
-    gentle = trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
-    return trial.success_change >= -of_tolerance * config.success_tolerance and gentle
+    succeeds = trial.success_change >= -of_tolerance * config.success_tolerance
+    presses = trial.pressed > of_tolerance * config.pressed_tolerance
+    return succeeds and not presses and trial.p95_force_n <= max(config.force_limit_n, _p95_force_n(reference))
 
 
 def keeps_task_after_all(
@@ -127,8 +136,13 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
 
 def largest_force_n(trajectories: Sequence[Trajectory]) -> float:
     """On the person, in any of them."""
-    return float(max(each.contact_force_n.max() for each in trajectories))
+    return float(_largest_forces(trajectories).max())
 
 
 def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:
-    return float(np.quantile([each.contact_force_n.max() for each in trajectories], 0.95))
+    return float(np.quantile(_largest_forces(trajectories), 0.95))
+
+
+def _largest_forces(trajectories: Sequence[Trajectory]) -> FloatArray:
+    """(N,) in N, of every episode."""
+    return np.array([each.contact_force_n.max() for each in trajectories])
