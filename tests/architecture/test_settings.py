@@ -24,6 +24,7 @@ from worker.domain import responses
 from worker.domain.spaces import CONTROL_STEP_S
 from worker.experiments import benchmark_cell, rollout_cache
 from worker.experiments.benchmark_cell import BenchmarkConfig
+from worker.jobs.learning import fits
 from worker.ml import acquisition
 from worker.ml.filters.exported import filter_module
 from worker.ml.filters.fitting.filter_problem import FilterConfig
@@ -44,8 +45,7 @@ def default(config: type, name: str) -> Any:
 @pytest.mark.parametrize(
     ("assumed", "usual"),
     [
-        (default(FilterConfig, "success_tolerance"), USUAL.success_tolerance),
-        (default(FilterConfig, "evaluation_scenarios"), USUAL.evaluation_scenarios),
+        (FilterConfig(), fits.filter_config(USUAL)),
         (default(Promise, "share"), USUAL.harm_share),
         (default(Promise, "confidence"), USUAL.harm_confidence),
         (default(Promise, "force_n"), USUAL.harm_force_n),

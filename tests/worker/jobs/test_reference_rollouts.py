@@ -73,6 +73,11 @@ def test_what_is_there_is_not_made_again(context: WorkerContext, monkeypatch: py
     assert list(context.outcomes.values()) == [met]
 
 
+def test_a_gate_refuses_what_could_not_be_promised_in_this_study() -> None:
+    strict = filter_config(StudySettings(harm_force_n=2, harm_share=0.02))
+    assert (strict.pressed_n, strict.pressed_tolerance) == (2, 0.014)
+
+
 def test_the_printed_method_which_has_no_gates_needs_the_evaluation_s_only() -> None:
     printed = SETTINGS.model_copy(update={"method": Method.PRINTED})
     assert reference_blocks("feeding", printed) == reference_blocks("feeding", SETTINGS)[-1:]

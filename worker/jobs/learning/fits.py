@@ -17,6 +17,9 @@ _BEFORE, _AFTER = 0.15, 0.7
 _MODE = 0.35
 """How far a fit without one is when it has its mode."""
 
+PRESSED_SHARE = 0.7
+"""Of the share of scenarios that may be harmed: what a gate lets pass, so that most of it can be promised."""
+
 
 def is_refined(settings: StudySettings, job: Job, shared: bool) -> bool:
     """Filters of all answers are, and those for several people (``shared``), which others are compared with."""
@@ -52,6 +55,7 @@ def filter_config(settings: StudySettings) -> FilterConfig:
     return FilterConfig(
         success_tolerance=settings.success_tolerance,
         pressed_n=settings.harm_force_n,
+        pressed_tolerance=round(PRESSED_SHARE * settings.harm_share, 4),
         evaluation_scenarios=settings.evaluation_scenarios,
     )
 

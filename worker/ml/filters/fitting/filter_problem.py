@@ -64,7 +64,7 @@ class FilterConfig:
     force_limit_n: float = 10.0
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
     pressed_n: float = 5.0
-    """of growth of an episode's largest force, from which on somebody counts as pressed; as the promise has it"""
+    """of growth of an episode's largest force, from which on somebody counts as pressed; as a study's promise has it"""
     pressed_tolerance: float = 0.035
     """largest accepted share of the gate's episodes in which somebody is pressed"""
     residual_rounds: int = 3
