@@ -144,6 +144,22 @@ STYLES_ARE_THERE = """async () => {
   const links = [...document.querySelectorAll("link[rel=stylesheet]")];
   while (!links.every((link) => link.sheet)) await new Promise((wake) => setTimeout(wake, 50));
 }"""
+"""Evaluated, not waited for as a function: the pages forbid what that evaluates."""
+
+
+OVERFLOW = """() => {
+  const page = document.documentElement;
+  return [page.scrollWidth - innerWidth, page.scrollHeight - innerHeight];
+}"""
+
+
+def overflow(page: Page) -> list[int]:
+    """By how many pixels the page is wider and higher than its window; nothing is measured before its styles count.
+
+    Whoever has just left a page first waits for something that only the next one has.
+    """
+    page.evaluate(STYLES_ARE_THERE)
+    return list(page.evaluate(OVERFLOW))
 
 
 LOOKED_AT: dict[str, dict[str, Any]] = {"light": {}, "dark": {"runOnly": ["color-contrast"]}}
@@ -169,7 +185,7 @@ def findings(page: Page, impacts: Collection[str] | None = None, options: dict[s
 
     A button that is still fading in has the contrast of no state a person reads.
     """
-    page.evaluate(STYLES_ARE_THERE)  # not wait_for_function: the pages forbid what it evaluates
+    page.evaluate(STYLES_ARE_THERE)
     page.evaluate(SETTLED)
     violations = Axe().run(page, options=options).response["violations"]
     return [

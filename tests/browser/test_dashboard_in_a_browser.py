@@ -15,7 +15,7 @@ from app.domain.studies import Study
 from app.services.participants import enrolment
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import PATIENCE_MS, findings
+from tests.browser.conftest import PATIENCE_MS, findings, overflow
 from tests.conftest import PASSWORD
 
 pytestmark = pytest.mark.browser
@@ -130,7 +130,7 @@ def test_new_links_and_their_sheet_shut_nobody_out(page: Page) -> None:
         for size in ((1366, 768), (390, 844)):
             page.set_viewport_size({"width": size[0], "height": size[1]})
             assert findings(page) == []
-            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+            assert overflow(page)[0] <= 0
         page.get_by_role("link", name="Sheet with QR codes").click()
         expect(page.get_by_role("link", name="Back to the links")).to_be_visible()
         page.wait_for_load_state()
@@ -171,7 +171,7 @@ def test_no_page_shuts_anybody_out(page: Page, scheme: str) -> None:
         for size in ((1366, 768), (390, 844)):
             page.set_viewport_size({"width": size[0], "height": size[1]})
             assert findings(page) == [], path
-            assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, path
+            assert overflow(page)[0] <= 0, path
 
 
 def test_a_task_is_chosen_with_the_keyboard_alone(page: Page) -> None:

@@ -8,7 +8,7 @@ from app.domain.clips import Clip
 from app.domain.preferences import Query
 from app.storage import ArtefactStore
 from tests import factories, stored_files
-from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
+from tests.browser.conftest import Invited, NewPage, overflow, serious_findings, the_only, wait_ready
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -343,10 +343,7 @@ def test_nothing_scrolls_and_everything_is_in_reach(
     page = new_page(viewport={"width": width, "height": height}, has_touch=width < 900, is_mobile=width < 900)
     page.goto(invited.link)
     wait_ready(page, 0)
-    overflow = page.evaluate(
-        "[document.documentElement.scrollWidth - innerWidth, document.documentElement.scrollHeight - innerHeight]"
-    )
-    assert overflow == [0, 0]
+    assert overflow(page) == [0, 0]
     for box in [each.bounding_box() for each in page.locator("video, button:visible").all()]:
         assert box is not None
         assert box["x"] >= 0

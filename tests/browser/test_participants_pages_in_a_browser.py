@@ -10,7 +10,7 @@ from app.domain.studies import Participant, Study
 from app.services.answers import form_answers
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, serious_findings, wait_ready
+from tests.browser.conftest import Invited, NewPage, overflow, serious_findings, wait_ready
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -37,7 +37,7 @@ def test_a_tap_enlarges_a_clip_and_another_brings_both_back(
     video.tap(position={"x": 20, "y": 20})
     expect(page.locator("[data-enlarged]")).to_be_visible()
     assert width_of(page, "left") > 1.5 * before
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert overflow(page)[0] <= 0
     video.tap(position={"x": 20, "y": 20})
     expect(page.locator("[data-enlarged]")).to_have_count(0)
     assert width_of(page, "left") == before
@@ -150,7 +150,7 @@ def test_a_standard_questionnaire_is_filled_in_with_the_keyboard_and_fits_a_phon
     page = new_page(viewport=SMALL)
     page.goto(invited.link)
     expect(page.get_by_role("group", name="I trust the system.")).to_be_visible()
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert overflow(page)[0] <= 0
     assert serious_findings(page) == []
     trust = page.get_by_role("group", name="I trust the system.")
     trust.get_by_role("radio", name="No answer").focus()
@@ -182,13 +182,13 @@ def test_scales_of_many_points_fit_every_screen_and_say_what_their_ends_mean(
     expect(effort.get_by_role("radio", name="100: very high")).to_be_visible()
     sizes = page.locator(".points .option").evaluate_all("all => all.map(each => each.getBoundingClientRect().width)")
     assert min(sizes) >= 24, "WCAG 2.5.8"
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert overflow(page)[0] <= 0
     assert serious_findings(page) == []
     page.get_by_role("button", name="Save and go on").click()
     expect(page.get_by_role("alert")).to_be_visible()
     page.get_by_role("button", name="Save and go on").click()
     expect(page.get_by_role("group", name="Happy")).to_be_visible()
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert overflow(page)[0] <= 0
     assert serious_findings(page) == []
 
 

@@ -9,7 +9,16 @@ from sqlalchemy import select
 from app.domain.participation import ParticipantEvent
 from app.domain.preferences import Purpose, Query
 from tests import factories
-from tests.browser.conftest import Invited, NewPage, hold_clips, let_clips_run, serious_findings, the_only, wait_ready
+from tests.browser.conftest import (
+    Invited,
+    NewPage,
+    hold_clips,
+    let_clips_run,
+    overflow,
+    serious_findings,
+    the_only,
+    wait_ready,
+)
 
 pytestmark = pytest.mark.browser
 
@@ -268,8 +277,7 @@ def test_practice_fits_the_screen_in_the_longer_language_too(
     page.goto(invited.link)
     expect(page.locator("[data-phase=ready]")).to_be_visible()
     expect(page.locator("[data-scrub]")).to_have_attribute("aria-valuetext", re.compile(r"^\d,\d von \d,\d Sekunden$"))
-    root = "document.documentElement"
-    assert page.evaluate(f"[{root}.scrollWidth - innerWidth, {root}.scrollHeight - innerHeight]") == [0, 0]
+    assert overflow(page) == [0, 0]
     for box in [each.bounding_box() for each in page.locator("video, button:visible, input:visible").all()]:
         assert box is not None
         assert box["x"] >= 0

@@ -13,7 +13,7 @@ from app.domain.studies import Study
 from app.services.accounts import api_tokens
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import NewPage, serious_findings
+from tests.browser.conftest import NewPage, overflow, serious_findings
 from tests.finished_study import make_finished_study
 from worker.analysis.study import figures
 from worker.analysis.study.report import make_report
@@ -98,7 +98,7 @@ def test_pages_of_results_have_no_serious_findings_and_fit(
     ):
         page.goto(path)
         assert serious_findings(page) == [], path
-        assert page.evaluate("document.documentElement.scrollWidth") <= width, path
+        assert overflow(page)[0] <= 0, path
     page.goto(f"{address_of_study}/results")
     assert _broken_pictures(page) == []
     assert elsewhere == []

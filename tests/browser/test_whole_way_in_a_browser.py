@@ -18,7 +18,7 @@ from app.domain.studies import Participant, Study
 from app.services.participants import recruitment_panel
 from app.storage import ArtefactStore
 from tests import factories
-from tests.browser.conftest import NewPage, serious_findings, wait_ready
+from tests.browser.conftest import NewPage, overflow, serious_findings, wait_ready
 
 pytestmark = pytest.mark.browser
 
@@ -121,7 +121,7 @@ def at(page: Page, name: str) -> None:
     assert serious_findings(page) == [], name
     for size in (PHONE, LAPTOP):
         page.set_viewport_size(size)  # type: ignore[arg-type]
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
+        assert overflow(page)[0] <= 0, f"{name} scrolls sideways"
 
 
 def test_the_whole_way_with_the_keyboard_alone_and_back_to_the_panel(
