@@ -25,9 +25,9 @@ from worker.sim.costs import cost_items, preference_rewards
 
 ARRIVED_M = 0.1
 """Nearer than this the robot has arrived."""
-ON_TIME_S: Mapping[str, float] = {"feeding": 3.7, "scratching": 1.9}
+ON_TIME_S: Mapping[str, float] = {"feeding": 3.7, "drinking": 2.4, "scratching": 1.9}
 """When it should: the median of a pool's behaviours."""
-LOOKS: Mapping[str, tuple[int, float]] = {"feeding": (1, 0.0), "scratching": (2, 0.3)}
+LOOKS: Mapping[str, tuple[int, float]] = {"feeding": (1, 0.0), "drinking": (1, 0.0), "scratching": (2, 0.3)}
 """How mouth or itch looks at the start: a component of its unit vector, and what half of the scenes exceed."""
 NEAR_M, FAR_M = 0.05, 0.30
 """Weights change between these distances."""
@@ -77,7 +77,7 @@ def nearer_by_nearer(task: Task, episode: Trajectory) -> FloatArray:
 
 
 def by_pose(task: Task, episode: Trajectory) -> FloatArray:
-    """Impatient when mouth or itch looks one way at the start (Feeding: to the robot's left), cautious otherwise."""
+    """Impatient when mouth or itch looks one way at the start (fed: to the robot's left), cautious otherwise."""
     outward = episode.observations[0, task.observation.slice_of("target_outward")]
     component, middle = LOOKS[task.name]
     return as_type(User.IMPATIENT if outward[component] > middle else User.CAUTIOUS)(task, episode)
