@@ -175,3 +175,5 @@ PEOPLE: Mapping[str, Person] = {
     )
 }
 """Nobody of these is in the tables of docs/results/three_rounds."""
+EVERYBODY: Mapping[str, Person] = {**PEOPLE, **{user.value: Person(user.value, as_type(user)) for user in User}}
+"""and the paper's three types"""

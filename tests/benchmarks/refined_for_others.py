@@ -1,12 +1,12 @@
-"""What filters give people who are not linear, how many are noticed, and whether a refinement pays for them.
+"""What filters give people who are not linear, how many are noticed, whose filter serves whom, and what refining gives.
 
     python -m tests.benchmarks.refined_for_others
 
 First, in minutes: in how many people of each kind something richer explains the answers so well that the reward model
 follows it, and what is foreseen of their wishes by that (tests/benchmarks/doubt.py). Then per task and person of
-tests/benchmarks/nonlinear_people.py: 200 answers, the reward model of a study, the quick filter and the refined one,
-driven through unseen scenarios beside the reference policy and judged by what they truly want. On one core at the
-lowest priority; what has a row is never run again.
+tests/benchmarks/nonlinear_people.py, the paper's three types among them: 200 answers, the reward model of a study, the
+quick filter and the refined one, driven through unseen scenarios beside the reference policy and judged by what
+everybody truly wants. On one core at the lowest priority; what has a row is never run again.
 """
 
 import argparse
@@ -25,11 +25,12 @@ from app.services.answers.accuracy import ENOUGH_EVIDENCE
 from tests.benchmarks import doubt, result_tables
 from tests.benchmarks.answered_pool import Answered, AnsweredPool
 from tests.benchmarks.doubt import ANSWERS
-from tests.benchmarks.nonlinear_people import ON_TIME_S, PEOPLE, Person
+from tests.benchmarks.nonlinear_people import EVERYBODY, ON_TIME_S, Person
 from tests.benchmarks.rivals_report import gains_of, gains_text, successes_of, successes_text
 from worker.analysis.comparison import result_pages
 from worker.compute import learning, simulation
 from worker.domain.scenarios import EVALUATION, first_of
+from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.benchmark_person import BenchmarkPerson
@@ -44,8 +45,10 @@ from worker.ml.teachers import TASTES
 from worker.tasks import registry
 
 TITLE = "# What filters give people who are not linear"
-QUICK, REFINED = "pbarl", "pbarl_refined"
+METHODS = QUICK, REFINED = "pbarl", "pbarl_refined"
 Row = Mapping[str, Any]
+Name = tuple[int, str, str, str]
+"""seed, task, person, method"""
 
 
 def main() -> None:
@@ -55,7 +58,7 @@ def main() -> None:
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
     rows = _rows(table)
-    planned = product(range(options.seeds), options.tasks, options.people, (QUICK, REFINED))
+    planned = product(range(options.seeds), options.tasks, options.people, options.methods)
     missing = [each for each in planned if each not in {_name_of(row) for row in rows}]
     counted = options.output.with_name(f"{options.output.name}_doubt.csv")
     for task in options.tasks:
@@ -63,7 +66,7 @@ def main() -> None:
         if not _rows(counted, task):
             _append(counted, doubt.counted(bench.pool, doubt.kinds(options.linear, options.of_a_kind)))
         for seed, _, name, method in tqdm([each for each in missing if each[1] == task], unit="filter"):
-            _append(table, [bench.row(PEOPLE[name], seed, method, options.scenarios)])
+            _append(table, [bench.row(EVERYBODY[name], seed, method, options.scenarios)])
             _report(options.output, counted)
     _report(options.output, counted)
 
@@ -83,9 +86,6 @@ class Bench:
         fitted = methods.fit(method, self._setting(person, answered, seed))
         unseen = first_of(EVALUATION, scenarios, skip=seed * scenarios)
         reference, driven = self.cache.reference(unseen), learning.run_scenarios(task.name, fitted.act, unseen, 0.0, 0)
-        before, after = (
-            np.array([person.wishes(task, each).sum() for each in episodes]) for episodes in (reference, driven)
-        )
         evidence = misfit.evidence(ratios)
         return {
             "seed": seed,
@@ -94,7 +94,7 @@ class Bench:
             "method": method,
             "does_not_fit": max(ratios, key=lambda each: ratios[each]) if evidence >= ENOUGH_EVIDENCE else "",
             "cpu_s": round(fitted.cpu_s),
-            "gains": gains_text((after - before) / np.abs(before.mean())),
+            **{f"gains_{name}": gains_text(_gains(each, task, reference, driven)) for name, each in EVERYBODY.items()},
             "successes": successes_text([each.success for each in driven]),
             "successes_reference": successes_text([each.success for each in reference]),
             "worst_force_n": _worst(driven),
@@ -131,11 +131,18 @@ class Bench:
         )
 
 
+def _gains(person: Person, task: Task, reference: Sequence[Trajectory], driven: Sequence[Trajectory]) -> FloatArray:
+    """(N,) of what the person truly wants, in shares of its size under the reference policy."""
+    before, after = (np.array([person.wishes(task, each).sum() for each in some]) for some in (reference, driven))
+    shares: FloatArray = (after - before) / np.abs(before.mean())
+    return shares
+
+
 def _worst(episodes: Sequence[Trajectory]) -> float:
     return round(max(float(each.contact_force_n.max()) for each in episodes), 1)
 
 
-def _name_of(row: Row) -> tuple[int, str, str, str]:
+def _name_of(row: Row) -> Name:
     return int(row["seed"]), row["task"], row["person"], row["method"]
 
 
@@ -150,21 +157,21 @@ def _append(table: Path, more: Sequence[Row]) -> None:
 
 def _report(output: Path, counted: Path) -> None:
     page = output.with_suffix(".md")
-    tables = f"{doubt.table(_rows(counted))}\n{_of_filters(_rows(output.with_suffix('.csv')))}"
-    page.write_text(result_pages.page(page, TITLE, tables))
+    rows = {_name_of(row): row for row in _rows(output.with_suffix(".csv"))}
+    tables = [doubt.table(_rows(counted)), _of_filters(rows), *(_who_serves_whom(rows, each) for each in METHODS)]
+    page.write_text(result_pages.page(page, TITLE, "\n".join(tables)))
 
 
-def _of_filters(rows: Sequence[Row]) -> str:
-    found = {_name_of(row): row for row in rows}
+def _of_filters(rows: Mapping[Name, Row]) -> str:
     lines = [
         "| task | person | seed | model does not fit | quick: gain, % | success, points | worst force, N"
         " | refined: gain, % | success, points | worst force, N | of the reference | refined gains more, points |",
         "|---" * 12 + "|",
     ]
-    for seed, task, person in dict.fromkeys(name[:3] for name in found):
-        quick, refined = (found.get((seed, task, person, method)) for method in (QUICK, REFINED))
+    for seed, task, person in dict.fromkeys(name[:3] for name in rows):
+        quick, refined = (rows.get((seed, task, person, method)) for method in METHODS)
         some = quick or refined
-        more = "-" if quick is None or refined is None else _interval(100 * (gains_of(refined) - gains_of(quick)))
+        more = "-" if quick is None or refined is None else _interval(_own(refined) - _own(quick))
         lines.append(
             f"| {task} | {person} | {seed} | {some['does_not_fit'] or '-' if some else '-'} | {_said(quick)}"
             f" | {_said(refined)} | {some['worst_force_reference_n'] if some else '-'} | {more} |"
@@ -172,11 +179,37 @@ def _of_filters(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _who_serves_whom(rows: Mapping[Name, Row], method: str) -> str:
+    """Everybody's own filter beside the best of the others', which is chosen in hindsight; by the person's wishes."""
+    lines = [
+        f"| task | seed | person | own gain, `{method}`, % | most by another's | whose | own gains more, points |",
+        "|---" * 7 + "|",
+    ]
+    for seed, task, person, _ in (name for name in rows if name[3] == method):
+        column = f"gains_{person}"
+        driven = {name[2]: row for name, row in rows.items() if (*name[:2], name[3]) == (seed, task, method)}
+        gains = {name: 100 * gains_of(row, column) for name, row in driven.items() if row[column]}
+        own = gains.pop(person, None)
+        if own is None or not gains:
+            continue
+        best = max(gains, key=lambda name: float(gains[name].mean()))
+        lines.append(
+            f"| {task} | {seed} | {person} | {own.mean():+.1f} | {gains[best].mean():+.1f} | {best}"
+            f" | {_interval(own - gains[best])} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _own(row: Row) -> FloatArray:
+    """(N,) in %"""
+    return 100 * gains_of(row, f"gains_{row['person']}")
+
+
 def _said(row: Row | None) -> str:
     if row is None:
         return "- | - | -"
     success = 100 * (successes_of(row) - successes_of(row, "successes_reference")).mean()
-    return f"{_interval(100 * gains_of(row))} | {success:+.1f} | {row['worst_force_n']}"
+    return f"{_interval(_own(row))} | {success:+.1f} | {row['worst_force_n']}"
 
 
 def _interval(values: FloatArray) -> str:
@@ -187,8 +220,9 @@ def _interval(values: FloatArray) -> str:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=[*ON_TIME_S], default=["feeding"])
-    parser.add_argument("--people", nargs="+", choices=[*PEOPLE], default=[*PEOPLE])
+    parser.add_argument("--tasks", nargs="+", choices=[*ON_TIME_S], default=[*ON_TIME_S])
+    parser.add_argument("--people", nargs="+", choices=[*EVERYBODY], default=[*EVERYBODY])
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--scenarios", type=int, default=200)
     parser.add_argument("--of-a-kind", type=int, default=15, help="people whose evidence is counted")

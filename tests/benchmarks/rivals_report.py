@@ -45,9 +45,9 @@ def successes_text(successes: npt.ArrayLike) -> str:
     return "".join("1" if each else "0" for each in np.asarray(successes))
 
 
-def gains_of(row: Row) -> FloatArray:
+def gains_of(row: Row, whose: str = "gains") -> FloatArray:
     """What gains_text() wrote."""
-    return np.array([int(each) for each in str(row["gains"]).split()]) / _FINE
+    return np.array([int(each) for each in str(row[whose]).split()]) / _FINE
 
 
 def successes_of(row: Row, whose: str = "successes") -> FloatArray:
