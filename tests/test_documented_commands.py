@@ -115,7 +115,6 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "mattered": ROLLOUTS,
     "misfit": ROLLOUTS,
     "more_ways": ROLLOUTS,
-    "other_users": ROLLOUTS,
     "refined_for_others": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
