@@ -128,15 +128,11 @@ def further_differences(
     pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()
 ) -> dict[str, FloatArray]:
     """What each richer model reads beside the signals' sums: right minus left, (N, F) each."""
-    return {name: each[:, 1] - each[:, 0] for name, each in further_sums(pairs, signal_names, scene).items()}
-
-
-def further_sums(pairs: SegmentPairs, signal_names: Sequence[str], scene: Sequence[int] = ()) -> dict[str, FloatArray]:
-    """The richer models' features of both sides, (N, 2, F) each."""
     columns = {name: pairs.signals[..., place].astype(np.float64) for place, name in enumerate(signal_names)}
     mean, deviation = explanations.usual_scene(pairs, scene)
     held = (pairs.observations[:, :, 0, list(scene)].astype(np.float64) - mean) / deviation
-    return {name: each.sum(axis=-2) for name, each in explanations.measured(columns, held).items()}
+    sums = {name: each.sum(axis=-2) for name, each in explanations.measured(columns, held).items()}
+    return {name: each[:, 1] - each[:, 0] for name, each in sums.items()}
 
 
 def by_spread(differences: FloatArray) -> FloatArray:
