@@ -158,7 +158,7 @@ def _append(table: Path, more: Sequence[Row]) -> None:
 def _report(output: Path, counted: Path) -> None:
     page = output.with_suffix(".md")
     rows = {_name_of(row): row for row in _rows(output.with_suffix(".csv"))}
-    tables = [doubt.table(_rows(counted)), _of_filters(rows), *(_who_serves_whom(rows, each) for each in METHODS)]
+    tables = [doubt.table(_rows(counted)), _of_filters(rows), *(who_serves_whom(rows, each) for each in METHODS)]
     page.write_text(result_pages.page(page, TITLE, "\n".join(tables)))
 
 
@@ -179,7 +179,7 @@ def _of_filters(rows: Mapping[Name, Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _who_serves_whom(rows: Mapping[Name, Row], method: str) -> str:
+def who_serves_whom(rows: Mapping[Name, Row], method: str) -> str:
     """Everybody's own filter beside the best of the others', which is chosen in hindsight; by the person's wishes."""
     lines = [
         f"| task | seed | person | own gain, `{method}`, % | most by another's | whose | own gains more, points |",

@@ -12,6 +12,8 @@ from tests.benchmarks.nonlinear_people import (
     on_time,
     worst_moment,
 )
+from tests.benchmarks.refined_for_others import who_serves_whom
+from tests.benchmarks.rivals_report import gains_text
 from tests.worker import invented
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import FloatArray
@@ -84,3 +86,23 @@ def test_somebody_who_drifts_answers_as_they_feel_by_then() -> None:
 def test_somebody_who_tires_errs_more_and_more() -> None:
     errs = [PEOPLE["tiring"].manner_at(share).mistakes for share in (0.0, 0.5, 1.0)]
     assert errs == pytest.approx([0.05, 0.225, 0.4])
+
+
+def test_everybodys_own_filter_is_set_beside_the_one_of_all_others_that_serves_them_best() -> None:
+    """Of the same task, seed and method; a filter that was judged by few wishes says nothing of the others."""
+    gained = {
+        ("tired", "quick"): {"tired": [0.1, 0.2], "wide": [0.3, 0.5]},
+        ("wide", "quick"): {"tired": [0.2, 0.2], "wide": [0.5, 0.5]},
+        ("old", "quick"): {"old": [0.9, 0.9]},
+        ("wide", "refined"): {"tired": [0.9, 0.9], "wide": [0.9, 0.9]},
+    }
+    names = ("tired", "wide", "old")
+    rows = {
+        (0, "feeding", person, method): {f"gains_{each}": gains_text(np.array(by.get(each, []))) for each in names}
+        for (person, method), by in gained.items()
+    }
+    table = who_serves_whom(rows, "quick").splitlines()[2:]
+    assert table == [
+        "| feeding | 0 | tired | +15.0 | +20.0 | wide | -5.0 [-14.8, +4.8] |",
+        "| feeding | 0 | wide | +50.0 | +40.0 | tired | +10.0 [-9.6, +29.6] |",
+    ]
