@@ -32,8 +32,8 @@ TITLE = "# Whether the studio notices that a model does not fit"
 ANSWERS = 200
 COUNTS = (60, 100, 200)
 """Evidence is written down after these."""
-CHOSEN_ON = range(4)
-"""Seeds that were seen when the fewest answers were chosen."""
+CHOSEN_ON = {(task, str(seed)) for task in ("feeding", "scratching") for seed in range(4)}
+"""Tasks and seeds that were seen when the fewest answers were chosen."""
 MISTAKES = (0.05, 0.10)
 LOOKS = [count for count in answered_pool.COUNTS if count >= misfit.FEWEST_ANSWERS]
 Row = dict[str, str]
@@ -107,8 +107,9 @@ def _tables(rows: Sequence[Row]) -> str:
     for name, mistakes in dict.fromkeys((row["person"], row["mistakes"]) for row in fits):
         some = [row for row in fits if (row["person"], row["mistakes"]) == (name, mistakes)]
         lines.append(f"| {name} | {float(mistakes):.0%} | {_flagged(some)} |")
-    chosen = [row for row in fits if int(row["seed"]) in CHOSEN_ON]
-    tried = [row for row in fits if int(row["seed"]) not in CHOSEN_ON]
+    chosen, tried = (
+        [row for row in fits if ((row["task"], row["seed"]) in CHOSEN_ON) == seen] for seen in (True, False)
+    )
     for words, some in (("the rule was chosen on these of them", chosen), ("and tried on these", tried)):
         if some:
             lines.append(f"| {words} | 5 and 10 % | {_flagged(some)} |")
