@@ -41,7 +41,8 @@ class AnsweredPool:
 
     def __init__(self, task: str, directory: Path) -> None:
         self.task = registry.task(task)
-        self.clips = RolloutCache(task, directory).behaviours(first_of(POOL, POOL_SCENARIOS))
+        self.episodes = RolloutCache(task, directory).pool(first_of(POOL, POOL_SCENARIOS))
+        self.clips = self.episodes.rollouts
         self.clip_steps = registry.installed_task(task).description.usual_clip_steps
         self.clip_pairs = acquisition.matched_pairs([each.scenario for each in self.clips])
         """(M, 2)"""

@@ -26,6 +26,7 @@ from worker.domain.type_aliases import Act, FloatArray
 from worker.ml import acquisition
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.fitting.filter_problem import FilterConfig
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.ml.teachers import Manner, ScriptedTeacher
@@ -166,7 +167,7 @@ def _driven(
                 {},
                 outcomes=OUTCOMES,
             )
-            act = act_of(task.modes, policy, fit.keep_promise(fit.find_mode(pool)).weights)
+            act = act_of(task.modes, policy, fit.keep_promise(fit.find_mode(Pool())).weights)
         seconds = time.perf_counter() - started
         driven = learning.run_scenarios(name, act, UNSEEN, 0.0, 0)
         with written_whole(file) as draft:

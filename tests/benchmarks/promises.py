@@ -106,7 +106,8 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
     fit._gate_reference()  # of both of which a worker has made sure beforehand
     fit._home_reference()
     started = time.process_time()
-    draft = fit.gate_residual(fit.train_residual(_refined(fit, fit.find_mode(bench.pool), bench.pool)))
+    mode = fit.find_mode(bench.setting().pool)
+    draft = fit.gate_residual(fit.train_residual(_refined(fit, mode, bench.pool)))
     fitted = time.process_time()
     bare = draft.weights
     draft = fit.keep_promise(draft)

@@ -121,7 +121,7 @@ class Bench:
         return Setting(
             problem=FilterProblem(task, simulation.reference_policy(task.name), reward, seed),
             labels=ANSWERS,
-            pool=pool.clips,
+            pool=pool.episodes,
             surface=lambda: ResponseSurface.load(simulation.surface_file(task.name), task.modes),
             action_reward=lambda: reward,
             reference=self.cache.reference,

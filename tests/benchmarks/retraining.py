@@ -102,7 +102,7 @@ def _run(
         version=len(PAPER_PROTOCOL.milestones),
         outcomes=outcomes,
     )
-    draft = fitting.find_mode(bench.pool)
+    draft = fitting.find_mode(bench.setting().pool)
     mark()
     draft = fitting.train_residual(draft)
     mark()

@@ -119,7 +119,7 @@ def learned(bench: BenchmarkUser) -> Iterator[tuple[str, Iterable[bytes]]]:
     draft = draft.shielded(bench.task.observation, home)
     yield "filter", [draft.weights.to_bytes()]
     yield "filter.onnx", [act_of(bench.task.modes, setting.problem.policy, draft.weights).exported.stored]
-    beginning = Beginning(setting.make_env, setting.pool, gate, gate, setting.collect)
+    beginning = Beginning(setting.make_env, setting.pool.rollouts, gate, gate, setting.collect)
     for refined in refine(setting.problem, draft, beginning, REFINEMENT):
         yield "refined filter", [refined.weights.to_bytes()]
     tuned = registry.fit("prefft", setting).act

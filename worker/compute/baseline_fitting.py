@@ -22,6 +22,7 @@ from worker.ml.export.blinded_controller import Blinded
 from worker.ml.filters.exported import filter_act
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import registry
 from worker.ml.methods.prefft import FineTuning
@@ -112,7 +113,7 @@ def _setting(baseline: Baseline, checkpoint: Checkpoint) -> Setting:
     return Setting(
         problem=FilterProblem(task, policy, load_reward_model(baseline.reward), baseline.seed),
         labels=baseline.labels,
-        pool=(),
+        pool=Pool(),
         surface=_no_surface,
         action_reward=lambda: _action_reward(baseline),
         reference=lambda scenarios: _collect(baseline.task, policy.mean, scenarios, 0.0, 0),

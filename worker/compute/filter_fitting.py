@@ -24,6 +24,7 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting import mode_search, policy_choice, printed_filter, residual
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
@@ -72,7 +73,7 @@ class FilterFit:
         config = replace(self.config, residual_rounds=0) if task.is_a_labs else self.config
         return FilterProblem(task, policy, load_reward_model(self.reward), self.seed, config)
 
-    def find_mode(self, pool: Sequence[Trajectory]) -> FilterDraft:
+    def find_mode(self, pool: Pool) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it; or their policy among several."""
         if isinstance(self.problem.task.modes, PolicyChoice):
             return self._choose(self.problem.task.modes)
@@ -128,10 +129,11 @@ class FilterFit:
         draft, reference, checkpoint = training.draft, training.reference, Checkpoint(begun)
         return is_promising(self.problem, draft, reference, training.config, checkpoint, self.collect)
 
-    def refine_ahead(self, known: Sequence[Trajectory], steps: int, train: TrainPatiently[bool]) -> None:
+    def refine_ahead(self, pool: Pool, steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""
         self._check_reference()  # while nobody waits for it
-        train(partial(refining.train_ahead, self._training(self.find_mode(known), known, steps, watched=True)))
+        training = self._training(self.find_mode(pool), pool.rollouts, steps, watched=True)
+        train(partial(refining.train_ahead, training))
 
     def _training(
         self, draft: FilterDraft, known: Sequence[Trajectory], steps: int, *, watched: bool

@@ -191,7 +191,7 @@ class BenchmarkUser:
         return Setting(
             problem=problem,
             labels=self.terms.labels,
-            pool=self.pool,
+            pool=self.rollout_cache.pool(self.terms.pool),
             surface=lambda: ResponseSurface.load(surface_file(self.cell.task), self.task.modes),
             action_reward=self._action_reward,
             reference=self.rollout_cache.reference,

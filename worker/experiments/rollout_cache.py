@@ -8,6 +8,7 @@ from pathlib import Path
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
 from worker.domain.trajectory import Trajectory
+from worker.ml.filters.fitting.pool import Pool
 from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.whole_files import written_whole
@@ -31,6 +32,11 @@ class RolloutCache:
     def behaviours(self, scenarios: Sequence[int]) -> list[Trajectory]:
         """Several behaviours of each scenario, as a pool of clips has them."""
         return [each for scenario in scenarios for each in self._behaviours(scenario)]
+
+    def pool(self, scenarios: Sequence[int]) -> Pool:
+        """These behaviours, and how each was done."""
+        drawn = [simulation.behaviours(self.task, each, BEHAVIOURS_PER_SCENARIO) for each in scenarios]
+        return Pool(self.behaviours(scenarios), [each.described() for some in drawn for each in some])
 
     def _reference(self, scenario: int) -> Trajectory:
         path = self.directory / f"reference-{scenario}.npz"

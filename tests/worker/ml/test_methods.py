@@ -19,6 +19,7 @@ from worker.ml.filters.encoders.fitted_q import ActionValue
 from worker.ml.filters.exported.filter_module import load_state
 from worker.ml.filters.fitting import response_surface
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.methods import prefft, registry
 from worker.ml.methods.best_of_n import BestOfN, fit_best_of_n
 from worker.ml.methods.latent_people import Latent
@@ -128,7 +129,7 @@ def setting(action_reward: MlpReward) -> Setting:
     return Setting(
         problem=FilterProblem(invented.TASK, POLICY, REWARD, 0, config),
         labels=LABELS,
-        pool=collect(POLICY.mean, range(4), 0.3, 0),
+        pool=Pool(collect(POLICY.mean, range(4), 0.3, 0), [{"temperature": 0.3}] * 4),
         surface=lambda: response_surface.fit(family, modes, deltas, np.ones(30)),
         action_reward=lambda: action_reward,
         reference=lambda scenarios: collect(POLICY.mean, scenarios, 0.0, 0),

@@ -19,6 +19,7 @@ from worker.ml.filters.fitting import mode_search, pbarl, residual, response_sur
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import trial_of, try_on
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.residual import learn_round
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
@@ -87,12 +88,12 @@ def surface() -> ResponseSurface:
     world, deltas = World(), []
     plain = world.collect(POLICY.mean, [0], 0.0, 0)[0].signals.sum(axis=0)
     for mode in modes:
-        act = _mode_act(mode)
+        act = mode_act(mode)
         deltas.append(world.collect(act, [0], 0.0, 0)[0].signals.sum(axis=0) - plain)
     return response_surface.fit(FAMILY, modes, np.array(deltas), np.ones(60))
 
 
-def _mode_act(mode: np.ndarray) -> Act:
+def mode_act(mode: np.ndarray) -> Act:
     values = mode.astype(np.float32)
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -126,7 +127,7 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
     draft = pbarl.fit_studio(
         problem(weight, reference),
         surface,
-        [],
+        Pool(),
         reference,
         no_more,
         world.collect,
@@ -144,7 +145,7 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
 def test_a_mode_that_fails_the_task_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.99 * plain)
-    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=1), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=1), surface, Pool(), reference, world.collect)
     assert found.weights.moves_nothing
     assert [trial.gate for trial in found.trials] == [1.0, 0.4]
     assert "off" in found.notes[0]
@@ -156,7 +157,7 @@ def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
     """The world forbids more than the surface knows: whoever is much slower than the reference fails."""
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.55 * plain)
-    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=4), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=4), surface, Pool(), reference, world.collect)
     assert found.trials[0].success_change < -0.9, "the first attempt must fail for the second to learn"
     assert found.trials[-1].success_change == 0.0
     assert found.trials[-1].preference > 0.0
@@ -168,7 +169,7 @@ def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory
         episodes = World().collect(act, scenarios, noise, seed)
         return [replace(each, contact_force_n=np.full(STEPS, 30.0, np.float32)) for each in episodes]
 
-    found = mode_search.find_mode(problem(-1.0, reference), surface, [], reference, pressing)
+    found = mode_search.find_mode(problem(-1.0, reference), surface, Pool(), reference, pressing)
     assert found.weights.moves_nothing
 
 
@@ -176,7 +177,7 @@ def test_somebody_who_has_said_nothing_yet_costs_no_rollouts(
     reference: list[Trajectory], surface: ResponseSurface
 ) -> None:
     world = World()
-    found = mode_search.find_mode(problem(0.0, reference), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(0.0, reference), surface, Pool(), reference, world.collect)
     assert found.weights.moves_nothing
     assert "do not yet say" in found.notes[0]
     assert world.asked == []
@@ -187,7 +188,7 @@ def test_of_the_modes_that_keep_the_task_the_best_is_taken(
 ) -> None:
     plain = min(each.signals[:, SPEED].mean() for each in reference)
     world = World(slowest=0.55 * plain)
-    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=6), surface, [], reference, world.collect)
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=6), surface, Pool(), reference, world.collect)
     kept = [trial.preference for trial in found.trials if trial.success_change == 0.0]
     assert len(kept) > 1, "several attempts must succeed for one to be better"
     assert found.trials[-1].preference == max(kept) > 0.0
@@ -254,8 +255,10 @@ def test_what_was_refined_is_driven_no_further(reference: list[Trajectory], surf
         return replace(draft, weights=draft.weights.changed(refined=POLICY.weights))
 
     world, searching = World(), World()
-    draft = pbarl.fit_studio(problem(-1.0, reference), surface, [], reference, no_more, world.collect, refined=refined)
-    mode_search.find_mode(problem(-1.0, reference), surface, [], reference, searching.collect)
+    draft = pbarl.fit_studio(
+        problem(-1.0, reference), surface, Pool(), reference, no_more, world.collect, refined=refined
+    )
+    mode_search.find_mode(problem(-1.0, reference), surface, Pool(), reference, searching.collect)
     assert draft.weights.refined
     assert not draft.weights.encoder
     assert world.asked == searching.asked

@@ -112,8 +112,7 @@ def fit_stage(
         return refinement.refine(context, run_id, job, reward, draft, shared)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     if stage in {"mode", "printed"}:
-        pool = fits.pool_rollouts(context, job)
-        result = fit.find_mode(pool) if stage == "mode" else fit.fit_printed()
+        result = fit.find_mode(fits.pool_of(context, job)) if stage == "mode" else fit.fit_printed()
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
         result = stages[stage](fits.load_draft(context, draft))

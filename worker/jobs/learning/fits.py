@@ -4,13 +4,13 @@ from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Promise
 from worker.compute.filter_fitting import FilterFit
-from worker.domain.trajectory import Trajectory
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig
+from worker.ml.filters.fitting.pool import Pool
 
 _BEFORE, _AFTER = 0.15, 0.7
 """How far a fit is before its refinement and after it."""
@@ -38,11 +38,11 @@ def _beside(share: float) -> float:
     return _AFTER + (1.0 - _AFTER) * (share - _MODE) / (1.0 - _MODE)
 
 
-def pool_rollouts(context: WorkerContext, job: Job) -> list[Trajectory]:
+def pool_of(context: WorkerContext, job: Job) -> Pool:
     """What the study's clips show, as whole episodes."""
     with context.database.reading() as session:
         clips = dataset.pool_clips(session, job.study_id)
-    return [dataset.shown(context.store, clip) for clip in clips]
+    return Pool([dataset.shown(context.store, clip) for clip in clips], [clip.rollout.mode for clip in clips])
 
 
 def load_draft(context: WorkerContext, artefact: str) -> FilterDraft:

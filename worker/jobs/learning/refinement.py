@@ -54,7 +54,7 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     with _folder(context, run_id, job, shared) as folder:
         train: TrainPatiently[tuple[FilterDraft, ...]] = _trainer(context, run_id, folder, lane, is_outdated, bool)
-        known = fits.pool_rollouts(context, job)
+        known = fits.pool_of(context, job).rollouts
         result = fit.refine(fits.load_draft(context, draft), known, settings.refinement_steps, begun, train)
         artefact = context.store.put(result.to_bytes()) if result else ""
         context.store.unfinished.forget(folder)
@@ -129,10 +129,10 @@ def _train_ahead(context: WorkerContext, run_id: int, job: Job, folder: Path, is
     fitted = reward_models.fit(context, run_id, job.participant, Lane.LEARNING, first)
     if fitted is None:
         return
-    known, fit = fits.pool_rollouts(context, job), fits.fitting(context, run_id, job, fitted.stored)
+    pool, fit = fits.pool_of(context, job), fits.fitting(context, run_id, job, fitted.stored)
     # Not in the patient lane, whose processes get next to nothing beside an earlier filter and clips.
     train: TrainPatiently[bool] = _trainer(context, run_id, folder, Lane.LEARNING, is_outdated, bool)
-    fit.refine_ahead(known, settings.refinement_steps, train)
+    fit.refine_ahead(pool, settings.refinement_steps, train)
 
 
 def _trainer(

@@ -24,6 +24,7 @@ from worker.ml.filters.exported import filter_act
 from worker.ml.filters.fitting import mode_search, pbarl
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.printed_filter import fit_printed
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.methods import (
@@ -90,8 +91,7 @@ class Setting:
     problem: FilterProblem
     """with the reward model that everybody is judged by"""
     labels: int
-    pool: Sequence[Trajectory]
-    """rollouts of many behaviours"""
+    pool: Pool
     surface: Callable[[], ResponseSurface]
     action_reward: Callable[[], RewardModel]
     """a model of the same labels that can score actions which were never executed"""
@@ -163,7 +163,7 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
     more_reference = partial(setting.reference, problem.config.check_block(problem.task))
     watched = setting.reference(problem.config.watch_block(problem.task))
-    beginning = refinement.Beginning(setting.make_env, setting.pool, reference, watched, setting.collect)
+    beginning = refinement.Beginning(setting.make_env, setting.pool.rollouts, reference, watched, setting.collect)
     first = setting.asked().labels.first(answers_ahead(setting.labels))
     early = replace(problem, reward=setting.asked().fit(first))
     mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)
@@ -257,7 +257,7 @@ def fit_dsrl(setting: Setting, flow: bool) -> tuple[Act, tuple[str, ...]]:
     reward, policy = learned(problem.reward), looked_into(problem.policy)
     largest = config.largest_noise
     decoder = (
-        fit_flow(setting.pool, policy, largest, config.flow_hidden, config.flow_steps, problem.seed)
+        fit_flow(setting.pool.rollouts, policy, largest, config.flow_hidden, config.flow_steps, problem.seed)
         if flow
         else dsrl.OwnNoise(policy, largest)
     )

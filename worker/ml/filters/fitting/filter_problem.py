@@ -47,6 +47,8 @@ class FilterConfig:
     """modes tried on held-out scenarios at full strength, each chosen knowing what came of those before"""
     modes_to_choose_from: int = 2
     """acceptable ones after which no further is tried"""
+    mode_attempts_beyond_sums: int = 5
+    """modes tried where the reward has further terms, of which less is known beforehand, and all to choose from"""
     success_caution: float = CAUTION
     """standard deviations by which the surface's log odds of success count less while a mode is sought"""
     gates: tuple[float, ...] = (0.6, 0.3)

@@ -12,15 +12,18 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import limits_of, untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.further_surface import FurtherSurface
 from worker.ml.filters.fitting.gate import acceptable, signal_changes, successes, try_on
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.ml.rewards.beyond_sums.terms import RicherReward
 from worker.ml.rewards.reward_models import StructuredReward
 
 
 def find_mode(
     problem: FilterProblem,
     surface: ResponseSurface,
-    pool: Sequence[Trajectory],
+    pool: Pool,
     reference: Sequence[Trajectory],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
@@ -31,28 +34,41 @@ def find_mode(
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
     and the search goes on from there, more careful about success with every trial that was not acceptable. When no
     attempt is acceptable the last mode is weakened; at worst it is off.
-    ``pool``: rollouts of many modes, used only when the reward is not linear in the signals.
+    ``pool``: rollouts of many modes, used only when the reward is not linear in the signals. Of a reward with further
+    terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
     started = time.perf_counter()
-    wishes = problem.reward.signal_weights(pool)
+    wishes = problem.reward.signal_weights(pool.rollouts)
+    further = _further(problem, wishes, pool)
+    attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
+    if further:
+        attempts = enough = problem.config.mode_attempts_beyond_sums
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     tried: list[tuple[GateTrial, FloatArray]] = []
     accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
-    for attempt in range(problem.config.mode_attempts):
-        if len(accepted) == problem.config.modes_to_choose_from:
+    for attempt in range(attempts):
+        if len(accepted) == enough:
             break
-        progress("searching the person's way of doing the task", 0.1 * attempt)
+        progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
         rejected = len(tried) - len(accepted)
         careful = problem.config.success_caution * (1 + rejected)
-        mode = best_mode(surface, wishes, problem.seed, caution=_caution(problem), success_caution=careful)
+        mode = best_mode(
+            surface,
+            wishes,
+            problem.seed,
+            caution=_caution(problem),
+            success_caution=careful,
+            further=further.coefficients if further else None,
+        )
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
-        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.1 * attempt)
+        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
         trial, driven = try_on(problem, _act_in(problem, off, mode), 1.0, 0.0, reference, collect)
         tried.append((trial, mode))
         if acceptable(problem, trial, reference):
             accepted.append((trial, mode, driven))
         surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
+        further = further.with_observed(mode, reference, driven) if further else None
     if not tried:
         return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
     for gate in problem.config.gates if not accepted else ():
@@ -72,6 +88,13 @@ def find_mode(
     ordered = (*(trial for trial in trials if trial is not chosen), chosen)
     tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
     return FilterDraft(weights, trials=ordered, tested=tested).timed("mode", started)
+
+
+def _further(problem: FilterProblem, wishes: FloatArray, pool: Pool) -> FurtherSurface | None:
+    """What modes do beyond sums of signals; None: the person's reward has nothing of the kind."""
+    if not isinstance(problem.reward, RicherReward):
+        return None
+    return FurtherSurface.of_pool(problem.reward, wishes.mean(axis=0), pool, problem.task.modes)
 
 
 def _caution(problem: FilterProblem) -> float:

@@ -10,6 +10,7 @@ from worker.domain.trajectory import Trajectory
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.mode_search import find_mode
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.residual import gate_residual, train_residual
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 
@@ -17,7 +18,7 @@ from worker.ml.filters.fitting.response_surface import ResponseSurface
 def fit_studio(
     problem: FilterProblem,
     surface: ResponseSurface,
-    pool: Sequence[Trajectory],
+    pool: Pool,
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,

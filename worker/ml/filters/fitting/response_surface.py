@@ -175,12 +175,14 @@ def best_mode(
     penalty: float = SUCCESS_PENALTY,
     caution: float = 0.0,
     success_caution: float = CAUTION,
+    further: FloatArray | None = None,
 ) -> FloatArray:
     """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
     The return counts as the members' mean less ``caution`` of their standard deviations. With a prior that expects
     something of people caution costs more than it saves, however few the labels (docs/results/few_answers.md). The
-    chance of success is taken ``success_caution`` of its standard deviations lower. Random search with two local
+    chance of success is taken ``success_caution`` of its standard deviations lower. ``further``: (M,) coefficients of
+    what a mode changes of the return beyond the signals. Random search with two local
     refinements; the mode 0 is always among the candidates and wins ties, so that somebody for whom nothing is better
     keeps the reference policy.
     """
@@ -189,18 +191,19 @@ def best_mode(
     members = np.atleast_2d(weights)
     reference = np.zeros((1, len(width)))
     candidates = np.concatenate([reference, rng.uniform(surface.low, surface.high, (DRAWS, len(width)))])
+    beyond = np.zeros(len(monomials(reference[0]))) if further is None else further
     signals, success = surface.predict(candidates, success_caution)
-    unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
+    unit = max(float((signals @ members.mean(axis=0) + monomials(candidates) @ beyond).std()), 1e-9)
 
-    def value(signals: FloatArray, success: FloatArray) -> FloatArray:
-        returns = signals @ members.T / unit
+    def value() -> FloatArray:
+        returns = (signals @ members.T + (monomials(candidates) @ beyond)[:, None]) / unit
         worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
         return worth - penalty * np.maximum(-success - tolerance, 0.0)
 
     for spread in (0.2, 0.05):
-        best = candidates[np.argsort(value(signals, success))[-40:]]
+        best = candidates[np.argsort(value())[-40:]]
         around = np.repeat(best, 100, axis=0) + spread * width * rng.standard_normal((4000, len(width)))
         candidates = np.concatenate([reference, best, np.clip(around, surface.low, surface.high)])
         signals, success = surface.predict(candidates, success_caution)
-    winner: FloatArray = candidates[np.argmax(value(signals, success))]
+    winner: FloatArray = candidates[np.argmax(value())]
     return winner
