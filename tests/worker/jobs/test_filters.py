@@ -36,6 +36,7 @@ from worker.jobs.runtime.due_work import answers_known, is_outdated
 from worker.jobs.runtime.records import Job
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.checkpoint import PAUSE_FILE, Abandoned, Checkpoint, ask_to_pause, begin_again
 from worker.ml.reinforcement.refinement import Refinement
 
@@ -174,7 +175,7 @@ def refining(monkeypatch: pytest.MonkeyPatch, context: WorkerContext, participan
         study = session.get_one(Study, participant.study_id)
         study.stored_settings = {**study.stored_settings, "refinement_steps": SHORTEST_REFINEMENT}
     monkeypatch.setattr(reward_models, "fit", lambda *_: SimpleNamespace(stored=b""))
-    monkeypatch.setattr(fits, "pool_rollouts", lambda *_: [])
+    monkeypatch.setattr(fits, "pool_of", lambda *_: Pool())
     monkeypatch.setattr(fits, "load_draft", lambda *_: None)
 
     def by(part: Callable[[Path], bool], **then: Any) -> None:

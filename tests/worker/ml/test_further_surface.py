@@ -86,9 +86,10 @@ def test_what_a_trial_shows_counts_more_than_what_the_pool_lets_expect(reference
 def test_only_episodes_in_which_nothing_but_the_mode_differed_say_what_modes_do(reference: list[Trajectory]) -> None:
     slow = {FAMILY.names[0]: -0.5}
     dressed: list[dict[str, Any]] = [{"mode": slow, "temperature": 0.4}, {"checkpoint": "early"}]
-    described = [{}, {"mode": slow}, *dressed, {}, {}]
+    of_another_version = {"mode": {"hop": 1.0}}
+    described = [{}, {"mode": slow}, *dressed, of_another_version, {}]
     modes, rollouts = Pool(reference, described).in_modes(FAMILY)
-    assert modes[:, 0].tolist() == [0.0, -0.5, 0.0, 0.0]
-    assert rollouts == [reference[0], reference[1], reference[4], reference[5]]
+    assert modes[:, 0].tolist() == [0.0, -0.5, 0.0]
+    assert rollouts == [reference[0], reference[1], reference[5]]
     with pytest.raises(ValueError, match="as many descriptions"):
         Pool(reference, described[1:])

@@ -24,11 +24,11 @@ class Pool:
             raise ValueError(f"{len(self.rollouts)} rollouts need as many descriptions, got {len(self.described)}.")
 
     def in_modes(self, family: ModeFamily) -> tuple[FloatArray, list[Trajectory]]:
-        """(M, A) modes and the rollouts in which nothing but the mode differed, by the axes that they name."""
+        """(M, A) modes and the rollouts in which nothing but the mode differed; not those of axes that are no more."""
         plain = [
             (family.vector(described.get("mode", {})), rollout)
             for described, rollout in zip(self.described, self.rollouts, strict=True)
-            if not described.keys() - {"mode"}
+            if not described.keys() - {"mode"} and {*described.get("mode", {})} <= {*family.names}
         ]
         modes = np.array([mode for mode, _ in plain], np.float64).reshape(len(plain), len(family.axes))
         return modes, [rollout for _, rollout in plain]

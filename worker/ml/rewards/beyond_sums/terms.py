@@ -89,7 +89,7 @@ class RicherReward(StructuredReward):
     kind: ClassVar[str] = "richer"
     terms: FurtherTerms
     of_sums: FloatArray
-    """(E, S) the weights without further terms: what modes do to sums of signals is known beforehand, and to terms not"""
+    """(E, S) the weights without further terms: what modes do to sums of signals is known beforehand, to terms not"""
 
     def __post_init__(self) -> None:
         if self.weights.shape[1] != self.terms.width:
