@@ -38,6 +38,7 @@ def test_three_small_regrets_in_a_row_are_enough(regrets: list[float | None], si
 
 def test_nothing_is_said_of_models_without_a_regret() -> None:
     assert stopping_advice.advice_of(models([None, None])) is None
+    assert stopping_advice.advice_of(models([0.05, 0.05, 0.05, None])) is None, "who is in doubt by now is not advised"
     assert stopping_advice.advice_of([]) is None
 
 

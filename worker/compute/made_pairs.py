@@ -23,7 +23,7 @@ def modes_of_pair(
     from worker.ml.filters.fitting.variations import variation
 
     model, described = load_reward_model(stored_model), registry.task(task)
-    if not isinstance(model, StructuredReward) or not surface_file(task).exists():
+    if not isinstance(model, StructuredReward) or not model.is_linear or not surface_file(task).exists():
         return []
     surface = ResponseSurface.load(surface_file(task), described.modes, described.signals)
     wanted = best_mode(surface, model.signal_weights(), seed)

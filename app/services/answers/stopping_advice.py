@@ -31,9 +31,10 @@ class Advice:
 
 
 def advice_of(models: Sequence[Model]) -> Advice | None:
-    """From a participant's reward models in the order of their labels; None while there is nothing to go by."""
-    known = [(model.label_count, regret) for model in models if (regret := _regret(model.metrics)) is not None]
-    return Advice(known[-1][1], enough_since(known)) if known else None
+    """From a participant's reward models in the order of their labels; None while the newest has nothing to go by."""
+    regrets = [(model.label_count, _regret(model.metrics)) for model in models]
+    known = [(label_count, regret) for label_count, regret in regrets if regret is not None]
+    return Advice(known[-1][1], enough_since(known)) if known and regrets[-1][1] is not None else None
 
 
 def enough_since(

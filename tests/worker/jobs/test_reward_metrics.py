@@ -11,12 +11,14 @@ from app.domain.clips import Clip
 from app.domain.studies import Participant
 from app.storage import ArtefactStore
 from tests.worker.jobs import test_query_selection
+from worker.compute.made_pairs import modes_of_pair
 from worker.compute.pools import Compute
 from worker.compute.simulation import surface_file
 from worker.domain.trajectory import COSTS, SIGNALS
 from worker.jobs.learning import dataset, query_selection, reward_metrics
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.fitting.response_surface import ResponseSurface
+from worker.ml.rewards.beyond_sums.terms import FurtherTerms, RicherReward
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.ml.stopping import relative_regret
 from worker.tasks.registry import task
@@ -82,6 +84,19 @@ def test_a_model_says_what_it_thinks_of_the_costs_of_the_studys_clips(
     found = reward_metrics.insight(context, participant.id, fears_spilling.to_bytes())["costs"]
     assert list(found["weights"]) == list(COSTS)
     assert 0.0 <= found["explained"] <= 1.0
+
+
+def test_nobody_is_advised_to_stop_by_sums_that_do_not_say_what_they_want(
+    context: WorkerContext, participant: Participant
+) -> None:
+    terms = FurtherTerms("worst_moments", SIGNALS, (), np.zeros(0), np.zeros(0))
+    weights = np.random.default_rng(3).standard_normal((8, terms.width))
+    linear = StructuredReward(weights[:, : len(SIGNALS)])
+    richer = RicherReward.with_terms(StructuredReward(weights), terms, linear.weights)
+    assert "advice" in reward_metrics.insight(context, participant.id, linear.to_bytes())
+    assert "advice" not in reward_metrics.insight(context, participant.id, richer.to_bytes())
+    assert modes_of_pair("feeding", linear.to_bytes(), 60, 0, 0)
+    assert not modes_of_pair("feeding", richer.to_bytes(), 60, 0, 0), "nor is a pair made by such sums"
 
 
 @pytest.fixture

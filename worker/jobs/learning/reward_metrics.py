@@ -14,7 +14,7 @@ from worker.jobs.learning import dataset
 from worker.jobs.runtime.context import WorkerContext
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.loading import load_reward_model
-from worker.ml.rewards.reward_models import RewardModel, StructuredReward
+from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import LEFT, SegmentPairs, Stretch
 from worker.ml.stopping import relative_regret
 from worker.tasks import registry
@@ -101,7 +101,7 @@ def _ranking(names: Sequence[tuple[int, int]], returns: FloatArray) -> list[list
 
 def _regret(task: str, model: RewardModel) -> float | None:
     """None for reward models that are not linear: their members' wishes are not known."""
-    if not isinstance(model, StructuredReward) or not surface_file(task).exists():
+    if not model.is_linear or not surface_file(task).exists():
         return None
     described = registry.task(task)
     surface = ResponseSurface.load(surface_file(task), described.modes, described.signals)

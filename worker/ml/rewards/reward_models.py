@@ -60,6 +60,8 @@ class RewardModel(ABC):
     """
 
     kind: ClassVar[str]
+    is_linear: ClassVar[bool] = False
+    """whether weights of the summed signals say all that it wants, and so what it wants of modes never tried"""
     normalisation: Normalisation = RAW
     temperature: float = 1.0
     """Log odds are divided by it before they are read as probabilities."""
@@ -211,6 +213,7 @@ class StructuredReward(RewardModel):
     """
 
     kind: ClassVar[str] = "structured"
+    is_linear: ClassVar[bool] = True
     weights: FloatArray
     """(E, S), reward per unit of each signal"""
     least_per_step: FloatArray | None = None

@@ -87,6 +87,7 @@ class RicherReward(StructuredReward):
     """Linear in the signals and in further terms, which depend on what came before in the episode."""
 
     kind: ClassVar[str] = "richer"
+    is_linear: ClassVar[bool] = False
     terms: FurtherTerms
     of_sums: FloatArray
     """(E, S) the weights without further terms: what modes do to sums of signals is known beforehand, to terms not"""
