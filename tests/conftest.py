@@ -31,7 +31,7 @@ from app.main import create_routes, make_studio, serve
 from app.services.accounts import accounts, browser_sessions
 from app.settings import Settings
 from app.storage import ArtefactStore
-from app.web.http.connections import Connection
+from app.web.http.connections import KEPT_OPEN_S, Connection
 from tests import buckets, databases
 from tests.databases import make_tables
 
@@ -199,9 +199,17 @@ def experimenter(client: TestClient, experimenter_cookie: str) -> TestClient:
 
 @contextmanager
 def serving(application: FastAPI) -> Iterator[str]:
-    """Runs a real server on a free port; gives its address."""
+    """Runs a real server on a free port; gives its address. Idle connections stay open as long as in a studio: by
+    uvicorn's own 5 s one is closed while a test on a busy machine is just sending."""
     server = uvicorn.Server(
-        uvicorn.Config(application, port=0, http=Connection, log_level="warning", timeout_graceful_shutdown=3)
+        uvicorn.Config(
+            application,
+            port=0,
+            http=Connection,
+            log_level="warning",
+            timeout_keep_alive=KEPT_OPEN_S,
+            timeout_graceful_shutdown=3,
+        )
     )
     thread = threading.Thread(target=server.run)
     thread.start()
