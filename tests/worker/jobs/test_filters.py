@@ -6,12 +6,13 @@ from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from sqlalchemy import func, select
 
 from app.db import Database
-from app.domain.clips import Clip
+from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.run_keys import RunKey
@@ -21,6 +22,7 @@ from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit
 from app.storage import ArtefactStore
 from tests.worker.at_hand import at_once
+from worker.compute.behaviours import Behaviour
 from worker.compute.pools import Compute
 from worker.jobs.learning import fits, refinement, reward_models
 from worker.jobs.learning.filters import (
@@ -39,6 +41,7 @@ from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.checkpoint import PAUSE_FILE, Abandoned, Checkpoint, ask_to_pause, begin_again
 from worker.ml.reinforcement.refinement import Refinement
+from worker.tasks.registry import task
 
 
 @pytest.fixture
@@ -107,6 +110,23 @@ def filter_at(context: WorkerContext, participant: Participant, milestone: int) 
 def outdated_at(context: WorkerContext, participant: Participant, milestone: int, *, begun: bool) -> bool:
     with context.database.reading() as session:
         return is_outdated(session, filter_at(context, participant, milestone), begun=begun)
+
+
+def test_a_study_knows_in_which_modes_the_episodes_of_its_pool_were_done(
+    context: WorkerContext, participant: Participant, add_clips: Callable[..., list[Clip]]
+) -> None:
+    """Of these filters for wishes beyond sums learn what modes do."""
+    with context.database.writing() as session:
+        slow, shaken, usual = (session.get_one(Clip, each.id).rollout_id for each in add_clips(1, 3))
+        session.get_one(Rollout, slow).mode = Behaviour({"speed_far": -0.4}).described()
+        session.get_one(Rollout, shaken).mode = Behaviour({"speed_far": 0.3}, disturbance=0.2).described()
+        session.get_one(Rollout, usual).mode = Behaviour().described()
+    job, _ = begin(context, participant, RunKind.FILTER)
+    pool, family = fits.pool_of(context, job), task("feeding").modes
+    modes, rollouts = pool.in_modes(family)
+    assert [family.named(mode)["speed_far"] for mode in modes] == [-0.4, 0.0]
+    assert np.abs(modes).sum() == 0.4
+    assert [len(each) for each in rollouts] == [len(pool.rollouts[0]), len(pool.rollouts[2])]
 
 
 def test_of_two_milestones_that_were_passed_only_the_newer_filter_is_trained(
