@@ -17,6 +17,7 @@ from worker.ml.filters.exported.filter_act import FilterAct, act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem
+from worker.ml.policies import checkpoint
 from worker.ml.policies.checkpoint import Checkpoint, Paused, ask_to_pause, begin_again, go_on_from
 from worker.ml.reinforcement import refinement, refinement_gate
 from worker.ml.reinforcement.guided_reward import guided
@@ -303,9 +304,10 @@ def test_where_the_whole_last_policy_loses_the_task_whatever_gains_most_is_next(
 
 
 def test_a_training_that_went_back_and_paused_ends_with_the_same_policies(
-    reference: list[Trajectory], watched: tuple[FilterDraft, ...], tmp_path: Path
+    reference: list[Trajectory], watched: tuple[FilterDraft, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a step with the task undone costs is in its checkpoint, and where it is held."""
+    monkeypatch.setattr(checkpoint, "NOTE_EVERY_S", 0.0)  # looking once a second, it may be done before it looks again
 
     def then_pausing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         driven = narrowly(act, scenarios, noise, seed)
