@@ -91,5 +91,9 @@ def test_only_episodes_in_which_nothing_but_the_mode_differed_say_what_modes_do(
     modes, rollouts = Pool(reference, described).in_modes(FAMILY)
     assert modes[:, 0].tolist() == [0.0, -0.5, 0.0]
     assert rollouts == [reference[0], reference[1], reference[5]]
+    forged: list[dict[str, Any]] = [
+        {"mode": each} for each in (7, ["x"], {FAMILY.names[0]: "x"}, {FAMILY.names[0]: 1e200})
+    ]
+    assert not len(Pool(reference[:4], forged).in_modes(FAMILY)[0])
     with pytest.raises(ValueError, match="as many descriptions"):
         Pool(reference, described[1:])

@@ -24,11 +24,20 @@ class Pool:
             raise ValueError(f"{len(self.rollouts)} rollouts need as many descriptions, got {len(self.described)}.")
 
     def in_modes(self, family: ModeFamily) -> tuple[FloatArray, list[Trajectory]]:
-        """(M, A) modes and the rollouts in which nothing but the mode differed; not those of axes that are no more."""
+        """(M, A) modes and the rollouts in which nothing but the mode differed. What is no mode of this family, as of
+        another version or from an archive that somebody has changed, is left out."""
         plain = [
             (family.vector(described.get("mode", {})), rollout)
             for described, rollout in zip(self.described, self.rollouts, strict=True)
-            if not described.keys() - {"mode"} and {*described.get("mode", {})} <= {*family.names}
+            if not described.keys() - {"mode"} and _is_of(family, described.get("mode", {}))
         ]
         modes = np.array([mode for mode, _ in plain], np.float64).reshape(len(plain), len(family.axes))
         return modes, [rollout for _, rollout in plain]
+
+
+def _is_of(family: ModeFamily, mode: Any) -> bool:
+    ranges = {axis.name: (axis.low, axis.high) for axis in family.axes}
+    return isinstance(mode, Mapping) and all(
+        name in ranges and isinstance(value, int | float) and ranges[name][0] <= value <= ranges[name][1]
+        for name, value in mode.items()
+    )
