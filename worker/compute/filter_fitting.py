@@ -21,7 +21,7 @@ from worker.domain.type_aliases import Act
 from worker.ml.filters.exported import filter_act
 from worker.ml.filters.exported.filter_act import FilterAct
 from worker.ml.filters.exported.filter_module import FilterWeights
-from worker.ml.filters.fitting import mode_search, policy_choice, printed_filter, residual
+from worker.ml.filters.fitting import mode_search, policy_choice, printed_filter, residual, residual_gate
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.pool import Pool
@@ -98,7 +98,7 @@ class FilterFit:
         """As much of the residual as held-out scenarios allow."""
         reference = self._gate_reference()
         home = self._home_reference
-        return residual.gate_residual(self.problem, draft, reference, home, self.collect, self.progress)
+        return residual_gate.gate_residual(self.problem, draft, reference, home, self.collect, self.progress)
 
     def refine(
         self,

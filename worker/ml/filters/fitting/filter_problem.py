@@ -59,7 +59,7 @@ class FilterConfig:
     """of USUAL_STEPS control steps, in which a refined policy is tried once more; see check_block()"""
     watch_scenarios: int = 200
     """of USUAL_STEPS control steps, in which a policy is tried while it is refined; see watch_block()"""
-    home_scenarios: int = 160
+    home_scenarios: int = 320
     """of USUAL_STEPS control steps, of the reference policy alone and of what was doubted; see home_block()"""
     success_tolerance: float = 0.035
     """largest accepted loss of success on the gate's scenarios, as a share of episodes"""
@@ -69,6 +69,9 @@ class FilterConfig:
     """of growth of an episode's largest force, from which on somebody counts as pressed; as a study's promise has it"""
     pressed_tolerance: float = 0.035
     """largest accepted share of the gate's episodes in which somebody is pressed"""
+    tolerance_in_all: float = 0.02
+    """largest accepted loss of success, and share of episodes in which somebody is pressed, of a residual that loses
+    anything in the gate's scenarios: in these and those of home_block() together"""
     residual_rounds: int = 3
     """of residual learning; 0 leaves the residual out"""
     residual_rollouts: int = 50
@@ -85,10 +88,10 @@ class FilterConfig:
     preference_weight: float = 0.3
     """lambda: weight of the normalised value against squared distance in policy standard deviations"""
     kl_weight: float = 1e-3
-    residual_shares: tuple[float, ...] = (1.0, 0.5)
-    """tried in this order until one is acceptable and better than the mode alone"""
     residual_beyond: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0)
-    """tried in this order after the whole was kept, as long as each is better than the last and keeps the task"""
+    """tried in this order after the whole, as long as each is better than the last and may keep the task"""
+    residual_parts: tuple[float, ...] = (0.5,)
+    """tried in this order where nothing from the whole on is better than the mode alone and keeps the task"""
     residual_gentle: float = 2.0
     """more of it is kept only where nobody is touched harder than the reference policy touches anybody there"""
     evaluation_scenarios: int = 100

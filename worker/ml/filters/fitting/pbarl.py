@@ -11,7 +11,8 @@ from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.pool import Pool
-from worker.ml.filters.fitting.residual import gate_residual, train_residual
+from worker.ml.filters.fitting.residual import train_residual
+from worker.ml.filters.fitting.residual_gate import gate_residual
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 
 

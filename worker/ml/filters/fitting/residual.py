@@ -1,11 +1,10 @@
-"""The second stage of the studio's filter: PbARL's action encoder as a residual around the mode, and its gate."""
+"""The second stage of the studio's filter: PbARL's action encoder as a residual around the mode."""
 
 import copy
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,10 +15,8 @@ from worker.ml.filters.encoders.action_encoder import ResidualAdapter, kl_diverg
 from worker.ml.filters.encoders.fitted_q import ActionValue, Transitions, evaluate_filter, spread_within_states
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import ModeTransform, load_state, state_of
-from worker.ml.filters.exported.shield import limits_of
-from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import Collect, FilterConfig, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import keeps_task_after_all, largest_force_n, to_beat, try_on
 from worker.ml.policies.torch_module import FrozenPolicy
 
 Learn = Callable[[FilterProblem, FilterDraft, Sequence[Sequence[Trajectory]]], FilterDraft]
@@ -96,64 +93,6 @@ def learn_round(problem: FilterProblem, draft: FilterDraft, rounds: Sequence[Seq
     _ascend(problem.config, networks, data.observations, bases, adapter_steps, generator)
     weights = draft.weights.changed(encoder=state_of(networks.adapter), residual_share=1.0)
     return replace(draft, weights=weights, value=state_of(networks.value)).timed("residual_learning", started)
-
-
-def gate_residual(
-    problem: FilterProblem,
-    draft: FilterDraft,
-    reference: Sequence[Trajectory],
-    more_reference: Callable[[], Sequence[Trajectory]],
-    collect: Collect,
-    progress: ReportProgress = lambda stage, share: None,
-) -> FilterDraft:
-    """Keep as much of the residual as keeps the task and is best by the learned return; possibly none.
-
-    It is held back by its distance from the mode, so for some people more than the whole of it is better still.
-    ``more_reference``: of the frozen policy in other scenarios, in which what fails a little too often is tried again.
-    """
-    if not draft.weights.encoder:
-        return draft
-    started = time.perf_counter()
-    config = problem.config
-    trials = list[GateTrial]()
-
-    def tried(share: float, beside: Sequence[Trajectory]) -> tuple[GateTrial, Sequence[Trajectory]]:
-        """What came of so much of it, and the rollouts."""
-        progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.01 * len(trials))
-        weights = draft.weights.changed(residual_share=share)
-        act = act_of(problem.task.modes, problem.policy, weights)
-        trial, driven = try_on(problem, act, weights.gate, share, beside, collect)
-        trials.append(trial)
-        return trial, driven
-
-    def in_others(share: float) -> GateTrial:
-        return tried(share, more_reference())[0]
-
-    alone = to_beat(problem, draft, reference)
-    kept: GateTrial | None = None
-    stayed: Sequence[Trajectory] = ()
-    for share in config.residual_shares:
-        trial, driven = tried(share, reference)
-        again = partial(in_others, share)
-        if trial.preference > alone and keeps_task_after_all(problem, trial, reference, again):
-            kept, stayed = trial, driven
-            break
-    if kept and kept.residual_share == 1.0:
-        for share in config.residual_beyond:
-            trial, driven = tried(share, reference)
-            gentle = share <= config.residual_gentle or largest_force_n(driven) <= largest_force_n(reference)
-            if not (trial.preference > kept.preference and gentle):
-                break
-            if not keeps_task_after_all(problem, trial, reference, partial(in_others, share), kept):
-                break
-            kept, stayed = trial, driven
-    weights = draft.weights.changed(residual_share=kept.residual_share if kept else 0.0)
-    notes = draft.notes
-    if kept is None:
-        notes = (*notes, "The residual did not help on held-out scenarios and is off.")
-    tested = limits_of(problem.task.observation, problem.task.action, stayed, reference) if kept else draft.tested
-    draft = replace(draft, weights=weights, trials=(*draft.trials, *trials), notes=notes, tested=tested)
-    return draft.timed("gate_residual", started)
 
 
 def _flat(rounds: Sequence[Sequence[Trajectory]]) -> list[Trajectory]:
