@@ -7,14 +7,14 @@ from pathlib import Path
 
 from app.settings import Settings
 from worker.commands.arguments import Commands, add_processes, add_task
-from worker.experiments import fit_response_surface, pretrain_policy, train_signal_predictor
+from worker.experiments import archive_modes, fit_response_surface, pretrain_policy, train_signal_predictor
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks.registry import checkpoint
 
 
 def add(commands: Commands) -> None:
-    """Add ``pretrain``, ``explore`` and ``foresee``."""
+    """Add ``pretrain``, ``explore``, ``archive`` and ``foresee``."""
     pretrain = commands.add_parser("pretrain", help=pretrain_policy.pretrain.__doc__)
     add_task(pretrain)
     pretrain.add_argument("--seed", type=int, default=0)
@@ -28,6 +28,12 @@ def add(commands: Commands) -> None:
     explore.add_argument("--sought", type=int, help="scenarios of every later round; default: a fifth of the first's")
     add_processes(explore)
     explore.set_defaults(act=_explore)
+
+    archive = commands.add_parser("archive", help=archive_modes.archive.__doc__)
+    add_task(archive)
+    archive.add_argument("--work-directory", type=Path, help="finished blocks; default: archive/ in the data directory")
+    add_processes(archive)
+    archive.set_defaults(act=_archive)
 
     foresee = commands.add_parser("foresee", help=train_signal_predictor.foresee.__doc__)
     add_task(foresee)
@@ -50,6 +56,13 @@ def _explore(said: argparse.Namespace) -> int:
     except (LabTaskBroken, NotAPolicy, fit_response_surface.NoRound) as error:
         sys.stderr.write(f"Error: {error}\n")
         return 1
+    sys.stdout.write(json.dumps(record, indent=2) + "\n")
+    return 0
+
+
+def _archive(said: argparse.Namespace) -> int:
+    work = said.work_directory or Settings().data_dir / "archive" / said.task
+    record = archive_modes.archive(said.task, work, said.processes)
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 

@@ -6,8 +6,10 @@ all of them apart.
 
 RESPONSE_SURFACE = range(100_000, 150_000)
 """Random modes, from which the response surface is fitted."""
-RESPONSE_SURFACE_SOUGHT = range(150_000, 200_000)
+RESPONSE_SURFACE_SOUGHT = range(150_000, 190_000)
 """Modes that somebody would want, with which it is refined."""
+MODE_ARCHIVE = range(190_000, 200_000)
+"""Modes that somebody would want, each in all of them."""
 SIGNAL_PREDICTOR = range(200_000, 250_000)
 SIGNAL_PREDICTOR_TEST = range(250_000, 300_000)
 POLICY_TRAINING = range(300_000, 1_000_000)

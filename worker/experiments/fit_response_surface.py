@@ -91,7 +91,7 @@ class Block:
     task: str
     first: int
     modes: FloatArray
-    """(BLOCK, MODES_PER_SCENARIO, A)"""
+    """(BLOCK, modes of each, A)"""
     file: Path
 
     def is_there(self) -> bool:
@@ -128,15 +128,15 @@ def explore(
     ]
     compute = Compute(processes)
     try:
-        _run(compute, blocks, "random modes")
+        run_blocks(compute, blocks, "random modes")
         for number in range(ROUNDS):
-            surface = _joined(blocks).fit(described)
+            surface = joined(blocks).fit(described)
             wanted = sought_blocks(compute, described, surface, number, work_directory, sought)
-            _run(compute, wanted, f"modes that people want, round {number + 1}")
+            run_blocks(compute, wanted, f"modes that people want, round {number + 1}")
             blocks += wanted
     finally:
         compute.close()
-    return _publish(described, scenarios, sought, _joined(blocks))
+    return _publish(described, scenarios, sought, joined(blocks))
 
 
 def find_ranges(task: str, scenarios: int = lab_ranges.SCENARIOS) -> None:
@@ -224,9 +224,9 @@ def sought_blocks(
     per_block = BLOCK * MODES_PER_SCENARIO
     rng = np.random.default_rng([number, 3])
     people = min(PEOPLE, count * per_block)
-    asked = [(surface, _somebody(task, surface, rng), number) for _ in range(people)]
+    asked = [(surface, somebody(task, surface, rng), number) for _ in range(people)]
     with tqdm(total=people, unit="person", desc=f"what people would want, round {number + 1}") as bar:
-        wanted = np.array(_run_all(compute, best_mode, asked, 16, bar))
+        wanted = np.array(run_all(compute, best_mode, asked, 16, bar))
     width = surface.high - surface.low
     blocks = []
     for index in range(count):
@@ -238,7 +238,7 @@ def sought_blocks(
     return blocks
 
 
-def _somebody(task: Task, surface: ResponseSurface, rng: np.random.Generator) -> FloatArray:
+def somebody(task: Task, surface: ResponseSurface, rng: np.random.Generator) -> FloatArray:
     """(S,) how much somebody drawn at random wants of each signal; of a laboratory's, each about equally much."""
     if not task.is_a_labs:
         taste = random_taste("somebody", rng)
@@ -251,13 +251,14 @@ def _somebody(task: Task, surface: ResponseSurface, rng: np.random.Generator) ->
     return wants
 
 
-def _run(compute: Compute, blocks: Sequence[Block], what: str) -> None:
+def run_blocks(compute: Compute, blocks: Sequence[Block], what: str) -> None:
+    """Those of them that were not run yet."""
     missing = [(block,) for block in blocks if not block.is_there()]
     with tqdm(total=len(blocks), initial=len(blocks) - len(missing), unit="block", desc=what) as bar:
-        _run_all(compute, compare_block, missing, 1, bar)
+        run_all(compute, compare_block, missing, 1, bar)
 
 
-def _run_all(
+def run_all(
     compute: Compute, function: Callable[..., R], arguments: list[tuple[Any, ...]], each: int, bar: "tqdm[Any]"
 ) -> list[R]:
     """Results in the order of the arguments; ``each``: calls that a process makes before the bar moves."""
@@ -269,7 +270,8 @@ def _run_all(
     return results
 
 
-def _joined(blocks: Sequence[Block]) -> Differences:
+def joined(blocks: Sequence[Block]) -> Differences:
+    """Of all of them, in their order."""
     loaded = [np.load(block.file, allow_pickle=False) for block in blocks]
     names = ("modes", "signals", "success", "reference_success")
     return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))

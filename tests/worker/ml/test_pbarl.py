@@ -21,7 +21,7 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import trial_of, try_on
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.residual import learn_round
-from worker.ml.filters.fitting.response_surface import ResponseSurface
+from worker.ml.filters.fitting.response_surface import ModeArchive, ResponseSurface
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
 
 POLICY = invented.small_policy()
@@ -162,6 +162,27 @@ def test_a_mode_that_fails_teaches_the_search_to_find_one_that_does_not(
     assert found.trials[-1].success_change == 0.0
     assert found.trials[-1].preference > 0.0
     assert (found.weights.gate, found.notes) == (1.0, ())
+
+
+def test_a_mode_that_was_tried_for_everybody_is_tried_first_and_taken_if_it_is_better(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    """The surface was fitted to the opposite, so that what it would seek is worse than nothing."""
+    slowest = np.array([axis.low if axis.name.startswith("speed") else 0.0 for axis in FAMILY.axes])
+    signals = np.zeros((1, len(SIGNALS)))
+    signals[:, SPEED] = -1.0
+    archive = ModeArchive(slowest[None], signals, np.zeros(1))
+    wrong = replace(surface, coefficients=-surface.coefficients)
+    asked = problem(-1.0, reference)
+    without = mode_search.find_mode(asked, wrong, Pool(), reference, World().collect)
+    found = mode_search.find_mode(asked, replace(wrong, archive=archive), Pool(), reference, World().collect)
+    assert found.weights.mode == FAMILY.named(slowest)
+    assert len(found.trials) == 1 + CONFIG.mode_attempts
+    assert found.trials[-1].preference > max(0.0, *(each.preference for each in without.trials))
+    off = replace(asked, config=replace(asked.config, mode_attempts=0))
+    assert not mode_search.find_mode(
+        off, replace(wrong, archive=archive), Pool(), reference, World().collect
+    ).weights.mode
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from worker.domain.trajectory import SIGNALS
-from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode, fit, monomials
+from worker.ml.filters.fitting.response_surface import ModeArchive, ResponseSurface, best_mode, fit, monomials
 from worker.tasks.feeding.environment import FEEDING
 
 FAMILY = FEEDING.modes
@@ -103,6 +103,32 @@ def test_it_survives_storage(surface: ResponseSurface, tmp_path: Path) -> None:
     modes = FAMILY.sample(5, np.random.default_rng(0))
     np.testing.assert_allclose(loaded.predict(modes)[0], surface.predict(modes)[0], atol=1e-5)
     assert surface.to_bytes() == loaded.to_bytes()
+
+
+def archive(**success: float) -> ModeArchive:
+    """Three modes that make the robot faster, the later the more."""
+    signals = np.zeros((3, len(SIGNALS)))
+    signals[:, SPEED] = [1.0, 2.0, 3.0]
+    modes = FAMILY.sample(3, np.random.default_rng(1))
+    return ModeArchive(modes, signals, np.array([0.0, 0.0, success.get("of_the_fastest", 0.0)]))
+
+
+def test_an_archive_survives_storage(surface: ResponseSurface) -> None:
+    stored = replace(surface, archive=archive()).to_bytes()
+    loaded = ResponseSurface.from_bytes(stored, FAMILY)
+    assert loaded.archive
+    np.testing.assert_allclose(loaded.archive.modes, archive().modes, atol=1e-6)
+    np.testing.assert_array_equal(loaded.archive.signals, archive().signals)
+    assert ResponseSurface.from_bytes(surface.to_bytes(), FAMILY).archive is None
+
+
+def test_the_best_of_an_archive_is_by_what_its_modes_did_and_keeps_the_task() -> None:
+    of_three, likes_it = archive(), likes(speed_m_s=1.0)
+    members = np.array([likes_it, -0.5 * likes_it])
+    for weights in (likes_it, members):
+        np.testing.assert_array_equal(of_three.best(weights), of_three.modes[2])
+    np.testing.assert_array_equal(archive(of_the_fastest=-0.1).best(likes_it), of_three.modes[1])
+    assert of_three.best(-likes_it) is None
 
 
 def test_a_surface_of_other_axes_is_refused(surface: ResponseSurface) -> None:

@@ -33,7 +33,8 @@ def find_mode(
     The best predicted mode lies where the surface knows least, and is the one whose success and return are most likely
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
     and the search goes on from there, more careful about success with every trial that was not acceptable. When no
-    attempt is acceptable the last mode is weakened; at worst it is off.
+    attempt is acceptable the last mode is weakened; at worst it is off. Where the surface has an archive, the best of
+    that is tried first, beside as many others (decision 187).
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals. Of a reward with further
     terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
@@ -43,6 +44,9 @@ def find_mode(
     attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
     if further:
         attempts = enough = problem.config.mode_attempts_beyond_sums
+    archived = surface.archive.best(wishes) if surface.archive and attempts else None
+    if archived is not None:
+        attempts, enough = attempts + 1, enough + 1
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     tried: list[tuple[GateTrial, FloatArray]] = []
     accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
@@ -50,16 +54,18 @@ def find_mode(
         if len(accepted) == enough:
             break
         progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
-        rejected = len(tried) - len(accepted)
-        careful = problem.config.success_caution * (1 + rejected)
-        mode = best_mode(
-            surface,
-            wishes,
-            problem.seed,
-            caution=_caution(problem),
-            success_caution=careful,
-            further=further.coefficients if further else None,
-        )
+        if archived is not None and not tried:
+            mode = archived
+        else:
+            rejected = len(tried) - len(accepted)
+            mode = best_mode(
+                surface,
+                wishes,
+                problem.seed,
+                caution=_caution(problem),
+                success_caution=problem.config.success_caution * (1 + rejected),
+                further=further.coefficients if further else None,
+            )
         if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)

@@ -34,6 +34,34 @@ REFERENCE_PRECISION = 0.1
 """Of the prior of the reference policy's log odds of success: it is known from data alone."""
 NEWTON_STEPS = 15
 LONGEST_STEP = 3.0
+_ARCHIVE = "archive/"
+
+
+@dataclass(frozen=True)
+class ModeArchive:
+    """K modes that people drawn from a population would be given by a response surface.
+
+    The surface errs by some percent where it promises most, so that what is best for one of them by measurement often
+    serves others better than what the surface calls best for these (decision 187).
+    """
+
+    modes: FloatArray
+    """(K, A)"""
+    signals: FloatArray
+    """(K, S) mean change of the episode's summed signals"""
+    success: FloatArray
+    """(K,) change of the share of episodes in which the task is done"""
+
+    def best(self, weights: FloatArray) -> FloatArray | None:
+        """(A,) the mode with the best return for these weights on the signals, (S,) or (E, S) for E members.
+
+        None: no mode is better than the reference policy.
+        """
+        returns = self.signals @ np.atleast_2d(weights).mean(axis=0)
+        unit = max(float(returns.std()), 1e-9)
+        lost = np.maximum(-self.success - SUCCESS_TOLERANCE, 0.0)
+        best = int(np.argmax(returns / unit - SUCCESS_PENALTY * lost))
+        return self.modes[best] if returns[best] > 0.0 else None
 
 
 @dataclass(frozen=True)
@@ -54,6 +82,8 @@ class ResponseSurface:
     axes: tuple[str, ...]
     signals: tuple[str, ...] = SIGNALS
     """names of the columns of the coefficients"""
+    archive: ModeArchive | None = None
+    """modes that were tried for everybody; None: none were"""
 
     def predict(self, modes: npt.ArrayLike, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """(..., A) -> changes of the summed signals (..., S) and of the chance of success (...).
@@ -83,8 +113,11 @@ class ResponseSurface:
         """One safetensors file."""
         config = {"axes": list(self.axes), "kind": "response surface", "signals": list(self.signals)}
         names = ("coefficients", "gram", "log_odds", "precision", "low", "high")
+        tensors = {name: getattr(self, name) for name in names}
+        if self.archive:
+            tensors |= {f"{_ARCHIVE}{name}": array for name, array in vars(self.archive).items()}
         return save(
-            {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in names},
+            {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()},
             metadata={"config": json.dumps(config, sort_keys=True)},
         )
 
@@ -97,7 +130,13 @@ class ResponseSurface:
                 "This response surface was fitted for other signals or axes; `python -m worker explore` fits another."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
-        return cls(**tensors, axes=family.names, signals=signals)
+        archived = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_ARCHIVE)}
+        archive = (
+            ModeArchive(**{name.removeprefix(_ARCHIVE): array for name, array in archived.items()})
+            if archived
+            else None
+        )
+        return cls(**tensors, axes=family.names, signals=signals, archive=archive)
 
     def save(self, path: Path) -> None:
         """Write to_bytes() to a file."""
