@@ -20,7 +20,7 @@ _VALUE, _TESTED = "value/", "tested/"
 
 @dataclass(frozen=True)
 class GateTrial:
-    """One setting tried on scenarios of the gate, or on the others in which what loses anything there is tried again."""
+    """One setting tried on the gate's scenarios, or on the others in which what loses anything there is tried again."""
 
     gate: float
     residual_share: float
