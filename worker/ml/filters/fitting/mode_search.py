@@ -34,7 +34,7 @@ def find_mode(
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
     and the search goes on from there, more careful about success with every trial that was not acceptable. When no
     attempt is acceptable the last mode is weakened; at worst it is off. Where the surface has an archive, the best of
-    that is tried first, beside as many others (decision 187).
+    that is tried, too (decision 187).
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals. Of a reward with further
     terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
@@ -44,44 +44,49 @@ def find_mode(
     attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
     if further:
         attempts = enough = problem.config.mode_attempts_beyond_sums
-    archived = surface.archive.best(wishes) if surface.archive and attempts else None
-    if archived is not None:
-        attempts, enough = attempts + 1, enough + 1
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     tried: list[tuple[GateTrial, FloatArray]] = []
     accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
-    for attempt in range(attempts):
-        if len(accepted) == enough:
-            break
-        progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
-        if archived is not None and not tried:
-            mode = archived
-        else:
-            rejected = len(tried) - len(accepted)
-            mode = best_mode(
-                surface,
-                wishes,
-                problem.seed,
-                caution=_caution(problem),
-                success_caution=problem.config.success_caution * (1 + rejected),
-                further=further.coefficients if further else None,
-            )
-        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
-            break
-        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
+
+    def driven_in(mode: FloatArray) -> Sequence[Trajectory]:
         trial, driven = try_on(problem, _act_in(problem, off, mode), 1.0, 0.0, reference, collect)
         tried.append((trial, mode))
         if acceptable(problem, trial, reference):
             accepted.append((trial, mode, driven))
+        return driven
+
+    for attempt in range(attempts):
+        if len(accepted) == enough:
+            break
+        progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
+        rejected = len(tried) - len(accepted)
+        careful = problem.config.success_caution * (1 + rejected)
+        mode = best_mode(
+            surface,
+            wishes,
+            problem.seed,
+            caution=_caution(problem),
+            success_caution=careful,
+            further=further.coefficients if further else None,
+        )
+        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
+            break
+        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
+        driven = driven_in(mode)
         surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
         further = further.with_observed(mode, reference, driven) if further else None
     if not tried:
         return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
+    sought = tried[-1][1]
+    archived = surface.archive.best(wishes) if surface.archive else None
+    if archived is not None:
+        progress("checking the best mode of the archive on held-out scenarios", 0.31)
+        driven_in(archived)
     for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
-        act = _act_in(problem, off.changed(gate=gate), tried[-1][1])
+        act = _act_in(problem, off.changed(gate=gate), sought)
         weakened, driven = try_on(problem, act, gate, 0.0, reference, collect)
-        tried.append((weakened, tried[-1][1]))
+        tried.append((weakened, sought))
         if acceptable(problem, weakened, reference):
             accepted = [(*tried[-1], driven)]
             break
