@@ -10,7 +10,7 @@ from worker.commands.arguments import Commands, add_processes, add_task
 from worker.experiments import archive_modes, fit_response_surface, pretrain_policy, train_signal_predictor
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.sim.lab.errors import LabTaskBroken
-from worker.tasks.registry import checkpoint
+from worker.tasks.registry import NotExplored, checkpoint
 
 
 def add(commands: Commands) -> None:
@@ -62,7 +62,11 @@ def _explore(said: argparse.Namespace) -> int:
 
 def _archive(said: argparse.Namespace) -> int:
     work = said.work_directory or Settings().data_dir / "archive" / said.task
-    record = archive_modes.archive(said.task, work, said.processes)
+    try:
+        record = archive_modes.archive(said.task, work, said.processes)
+    except (archive_modes.NoSurface, NotExplored) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 

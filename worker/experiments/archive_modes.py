@@ -25,15 +25,22 @@ PEOPLE = 96
 SCENARIOS = 200
 
 
+class NoSurface(ValueError):
+    """There is nothing by which modes could be found."""
+
+
 def archive(
     task: str, work_directory: Path, processes: int, people: int = PEOPLE, scenarios: int = SCENARIOS
 ) -> dict[str, Any]:
     """Drive what is missing and write the archive into the task's response surface and its record, which is returned.
 
-    Raises ValueError where the surface was fitted for other signals or axes. ``scenarios``: in whole BLOCKs.
+    Raises NoSurface where there is none, and ValueError where it was fitted for other signals or axes.
+    ``scenarios``: in whole BLOCKs. Whoever explores the task anew needs another archive.
     """
-    work_directory.mkdir(parents=True, exist_ok=True)
     described, file = registry.task(task), simulation.surface_file(task)
+    if not file.exists():
+        raise NoSurface(f"There is no response surface; `python -m worker explore --task {task}` fits one.")
+    work_directory.mkdir(parents=True, exist_ok=True)
     surface = replace(ResponseSurface.load(file, described.modes, described.signals), archive=None)
     rng = np.random.default_rng([people, 4])
     asked = [(surface, somebody(described, surface, rng), 0) for _ in range(people)]

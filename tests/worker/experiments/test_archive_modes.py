@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from worker.__main__ import main
 from worker.compute import simulation
 from worker.experiments import archive_modes
 from worker.experiments.fit_response_surface import BLOCK, Block
@@ -40,6 +41,17 @@ def test_what_modes_changed_is_kept_beside_the_surface_and_driven_once(
     monkeypatch.setattr(archive_modes, "run_blocks", lambda compute, blocks, what: assert_all_there(blocks))
     archive_modes.archive(TASK.name, work, 1, people=2, scenarios=BLOCK)
     assert file.read_bytes() == written
+
+
+def test_a_task_that_was_not_explored_is_told_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(simulation, "surface_file", lambda task: tmp_path / "none.safetensors")
+    assert main(["archive", "--task", TASK.name, "--work-directory", str(tmp_path / "work")]) == 1
+    assert capsys.readouterr().err == (
+        "Error: There is no response surface; `python -m worker explore --task scratching` fits one.\n"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def assert_all_there(blocks: list[Block]) -> None:
