@@ -131,6 +131,41 @@ def test_the_best_of_an_archive_is_by_what_its_modes_did_and_keeps_the_task() ->
     assert of_three.best(-likes_it) is None
 
 
+def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like_them(surface: ResponseSurface) -> None:
+    """Modes with this speed and height press harder than a cubic says, and fail once in ten."""
+    tried, like, unlike = [0.4, -0.5, 0.4, 0.5, 0], [0.37, -0.45, 0.4, 0.45, 0], [-0.5, 0.5, -0.6, -0.6, 0]
+    modes = np.array([tried, like, unlike, FAMILY.reference])
+    before, success_before = surface.predict(modes)
+    measured = before[0].copy()
+    measured[SPEED] += 1.0
+    known = replace(surface, archive=ModeArchive(modes[:1], measured[None], success_before[:1] - 0.1))
+    after, success_after = known.predict(modes)
+    gained, lost = (after - before)[:, SPEED], success_before - success_after
+    assert gained[0] == pytest.approx(0.9, abs=0.02)
+    assert 0.8 < gained[1] < gained[0]
+    assert abs(gained[2]) < 0.05
+    assert gained[3] == lost[3] == 0.0
+    np.testing.assert_allclose(lost, 0.1 * gained, atol=1e-9)
+    assert np.delete(after - before, SPEED, axis=1) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_mode_that_disappoints_is_not_sought_again_where_an_archive_is(surface: ResponseSurface) -> None:
+    wants = likes(speed_m_s=1.0)
+    sure = replace(surface, gram=30 * surface.gram)
+    far = np.array([[-0.5, -0.5, 0.5, 0.5, 0.3]])
+    known = replace(sure, archive=ModeArchive(far, *sure.predict(far)))
+    chosen = best_mode(known, wants, seed=0)
+    expected = known.predict(chosen)[0]
+    less = np.repeat((expected - 0.5 * likes(speed_m_s=1.0))[None], 80, axis=0)
+    learned = known.with_observed(chosen, less, np.ones(80))
+    assert learned.archive
+    assert len(learned.archive.modes) == 2
+    assert learned.predict(chosen)[0][SPEED] < expected[SPEED] - 0.4
+    assert sure.with_observed(chosen, less, np.ones(80)).predict(chosen)[0][SPEED] > expected[SPEED] - 0.4
+    again = best_mode(learned, wants, seed=0)
+    assert np.abs((again - chosen) / (surface.high - surface.low)).max() > 0.1
+
+
 def test_a_surface_of_other_axes_is_refused(surface: ResponseSurface) -> None:
     fewer = replace(FAMILY, axes=FAMILY.axes[:3])
     with pytest.raises(ValueError, match="other signals or axes"):

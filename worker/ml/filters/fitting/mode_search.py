@@ -41,6 +41,7 @@ def find_mode(
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool.rollouts)
     further = _further(problem, wishes, pool)
+    archive = surface.archive
     attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
     if further:
         attempts = enough = problem.config.mode_attempts_beyond_sums
@@ -78,7 +79,7 @@ def find_mode(
     if not tried:
         return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
     sought = tried[-1][1]
-    archived = surface.archive.best(wishes) if surface.archive else None
+    archived = archive.best(wishes) if archive else None
     if archived is not None:
         progress("checking the best mode of the archive on held-out scenarios", 0.31)
         driven_in(archived)

@@ -6,6 +6,7 @@ same scenario. Given a person's weights on the signals, their best mode is then 
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -34,6 +35,10 @@ REFERENCE_PRECISION = 0.1
 """Of the prior of the reference policy's log odds of success: it is known from data alone."""
 NEWTON_STEPS = 15
 LONGEST_STEP = 3.0
+LENGTH = 0.5
+"""of the axes' ranges, over which what a regression gets wrong is alike"""
+NOISE = 0.1
+"""Share of an archive's measured errors that is expected to be chance."""
 _ARCHIVE = "archive/"
 
 
@@ -63,10 +68,19 @@ class ModeArchive:
         best = int(np.argmax(returns / unit - SUCCESS_PENALTY * lost))
         return self.modes[best] if returns[best] > 0.0 else None
 
+    def with_tried(self, mode: FloatArray, signals: FloatArray, success: float) -> Self:
+        """With one mode more: (A,), (S,) and the change of success."""
+        return type(self)(
+            np.vstack([self.modes, mode]), np.vstack([self.signals, signals]), np.append(self.success, success)
+        )
+
 
 @dataclass(frozen=True)
 class ResponseSurface:
-    """psi(mode) @ coefficients: change of the summed signals; sigmoid([1, psi(mode)] @ log_odds): chance of success."""
+    """psi(mode) @ coefficients: change of the summed signals; sigmoid([1, psi(mode)] @ log_odds): chance of success.
+
+    What these get wrong in the modes of an archive is expected of modes like them, too (decision 188).
+    """
 
     coefficients: FloatArray
     """(M, S)"""
@@ -90,11 +104,35 @@ class ResponseSurface:
 
         With ``caution`` the log odds of success are taken so many of their standard deviations lower.
         """
-        features = monomials(np.asarray(modes, np.float64))
+        at = np.asarray(modes, np.float64)
+        signals, success = self._regressed(at, caution)
+        if self.archive is None:
+            return signals, success
+        wrong = self._likeness(at, self.archive) @ self._corrections
+        return signals + wrong[..., :-1], success + wrong[..., -1]
+
+    def _regressed(self, modes: FloatArray, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        features = monomials(modes)
         doubt = np.linalg.inv(self.precision)[1:, 1:]
         deviation = np.sqrt(np.maximum(((features @ doubt) * features).sum(axis=-1), 0.0))
         change = features @ self.log_odds[1:] - caution * deviation
         return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
+
+    @cached_property
+    def _corrections(self) -> FloatArray:
+        """(K, S + 1) weights of the archive's modes: Gaussian process regression of the errors in them."""
+        assert self.archive is not None  # noqa: S101 -- predict() asks only then
+        signals, success = self._regressed(self.archive.modes)
+        wrong = np.column_stack([self.archive.signals - signals, self.archive.success - success])
+        likeness = self._likeness(self.archive.modes, self.archive)
+        return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), wrong), np.float64)
+
+    def _likeness(self, modes: FloatArray, archive: ModeArchive) -> FloatArray:
+        """(..., A) -> (..., K) covariances with the archive's modes, given that the mode 0 changes nothing."""
+        asked, tried = (each / (LENGTH * (self.high - self.low)) for each in (modes, archive.modes))
+        from_reference = [(each**2).sum(axis=-1) for each in (asked, tried)]
+        both = from_reference[0][..., None] + from_reference[1]
+        return np.asarray(np.exp(asked @ tried.T - both / 2) - np.exp(-both / 2), np.float64)
 
     def with_observed(self, mode: FloatArray, signal_deltas: FloatArray, successes: FloatArray) -> Self:
         """The surface after N more rollouts of one mode (A,): as if it had been fitted with them.
@@ -107,7 +145,12 @@ class ResponseSurface:
         repeated = np.repeat(_with_one(features[None]), len(successes), axis=0)
         log_odds, precision = _logistic(repeated, successes, self.log_odds, self.precision)
         coefficients = np.asarray(np.linalg.solve(gram, moments), np.float64)
-        return replace(self, coefficients=coefficients, gram=gram, log_odds=log_odds, precision=precision)
+        tried = self.archive and self.archive.with_tried(
+            mode, signal_deltas.mean(axis=0), float(successes.mean() - expit(self.log_odds[0]))
+        )
+        return replace(
+            self, coefficients=coefficients, gram=gram, log_odds=log_odds, precision=precision, archive=tried
+        )
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""
