@@ -325,8 +325,10 @@ def share(task: Task, found: Differences, predicted: FloatArray) -> dict[str, fl
 
 
 def _publish(task: Task, scenarios: int, sought: int, found: Differences) -> dict[str, Any]:
-    surface, successes = found.fit(task), found.successes
-    surface.save(simulation.surface_file(task.name))
+    surface, successes, file = found.fit(task), found.successes, simulation.surface_file(task.name)
+    recorded = file.with_suffix(".json")
+    had_archive = recorded.exists() and "archive" in json.loads(recorded.read_text())
+    surface.save(file)
     record = {
         "command": f"python -m worker explore --task {task.name} --scenarios {scenarios} --sought {sought}",
         "scenarios": [RESPONSE_SURFACE.start, RESPONSE_SURFACE[scenarios - 1]],
@@ -339,7 +341,12 @@ def _publish(task: Task, scenarios: int, sought: int, found: Differences) -> dic
         "foreseen_share": share(task, found, foreseen(task, found)),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
-    simulation.surface_file(task.name).with_suffix(".json").write_text(json.dumps(record, indent=2) + "\n")
+    recorded.write_text(json.dumps(record, indent=2) + "\n")
+    if had_archive:
+        tqdm.write(
+            "The archive of modes went with the surface that they were found by: "
+            f"`python -m worker archive --task {task.name}` makes another."
+        )
     if task.is_a_labs and (said := little_foreseen(record, task)):
         tqdm.write(said)
     return record

@@ -1,5 +1,6 @@
 """Exploring what modes change: at random, and where people would want to go."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,23 @@ def test_every_round_seeks_anew_and_the_same_again_when_repeated(tmp_path: Path)
     rounds = fit_response_surface.ROUNDS * sum(block.modes.shape[1] + 1 for block in first) * BLOCK
     random = fit_response_surface.SCENARIOS * (MODES_PER_SCENARIO + 1)
     assert fit_response_surface.block_episodes(fit_response_surface.SCENARIOS) == random + rounds
+
+
+@pytest.mark.long
+def test_whoever_explores_anew_is_told_that_the_archive_of_modes_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped = simulation.surface_file("scratching")
+    file, work = tmp_path / shipped.name, tmp_path / "work"
+    for each in (shipped, shipped.with_suffix(".json")):
+        shutil.copy(each, tmp_path)
+    monkeypatch.setattr(simulation, "surface_file", lambda task: file)
+    told = "`python -m worker archive --task scratching` makes another"
+    fit_response_surface.explore("scratching", work, 2, BLOCK, BLOCK)
+    assert told in capsys.readouterr().out
+    assert ResponseSurface.load(file, registry.task("scratching").modes).archive is None
+    fit_response_surface.explore("scratching", work, 2, BLOCK, BLOCK)
+    assert told not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("count", [-10, 0, 15, len(RESPONSE_SURFACE) + BLOCK])
