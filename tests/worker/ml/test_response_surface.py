@@ -132,7 +132,7 @@ def test_the_best_of_an_archive_is_by_what_its_modes_did_and_keeps_the_task() ->
 
 
 def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like_them(surface: ResponseSurface) -> None:
-    """Modes with this speed and height press harder than a cubic says, and fail once in ten."""
+    """Modes with this speed and height are quicker than a cubic says; that one fails once in ten may be chance."""
     tried, like, unlike = [0.4, -0.5, 0.4, 0.5, 0], [0.37, -0.45, 0.4, 0.45, 0], [-0.5, 0.5, -0.6, -0.6, 0]
     modes = np.array([tried, like, unlike, FAMILY.reference])
     before, success_before = surface.predict(modes)
@@ -140,12 +140,12 @@ def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like
     measured[SPEED] += 1.0
     known = replace(surface, archive=ModeArchive(modes[:1], measured[None], success_before[:1] - 0.1))
     after, success_after = known.predict(modes)
-    gained, lost = (after - before)[:, SPEED], success_before - success_after
+    gained = (after - before)[:, SPEED]
     assert gained[0] == pytest.approx(0.9, abs=0.02)
     assert 0.8 < gained[1] < gained[0]
     assert abs(gained[2]) < 0.05
-    assert gained[3] == lost[3] == 0.0
-    np.testing.assert_allclose(lost, 0.1 * gained, atol=1e-9)
+    assert gained[3] == 0.0
+    np.testing.assert_array_equal(success_after, success_before)
     assert np.delete(after - before, SPEED, axis=1) == pytest.approx(0.0, abs=1e-9)
 
 

@@ -38,7 +38,7 @@ LONGEST_STEP = 3.0
 LENGTH = 0.5
 """of the axes' ranges, over which what a regression gets wrong is alike"""
 NOISE = 0.1
-"""Share of an archive's measured errors that is expected to be chance."""
+"""Variance of an archive's measured errors that is expected to be chance, in units of that which is not."""
 _ARCHIVE = "archive/"
 
 
@@ -69,7 +69,7 @@ class ModeArchive:
         return self.modes[best] if returns[best] > 0.0 else None
 
     def with_tried(self, mode: FloatArray, signals: FloatArray, success: float) -> Self:
-        """With one mode more: (A,), (S,) and the change of success."""
+        """With one mode more: (A,), (S,) and its change of success."""
         return type(self)(
             np.vstack([self.modes, mode]), np.vstack([self.signals, signals]), np.append(self.success, success)
         )
@@ -79,7 +79,8 @@ class ModeArchive:
 class ResponseSurface:
     """psi(mode) @ coefficients: change of the summed signals; sigmoid([1, psi(mode)] @ log_odds): chance of success.
 
-    What these get wrong in the modes of an archive is expected of modes like them, too (decision 188).
+    What the first gets wrong in the modes of an archive is expected of modes like them, too. Of success it is not: what
+    200 scenarios say of that is half chance, and the luckiest would be sought (decision 188).
     """
 
     coefficients: FloatArray
@@ -108,8 +109,7 @@ class ResponseSurface:
         signals, success = self._regressed(at, caution)
         if self.archive is None:
             return signals, success
-        wrong = self._likeness(at, self.archive) @ self._corrections
-        return signals + wrong[..., :-1], success + wrong[..., -1]
+        return signals + self._likeness(at, self.archive) @ self._corrections, success
 
     def _regressed(self, modes: FloatArray, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         features = monomials(modes)
@@ -120,10 +120,9 @@ class ResponseSurface:
 
     @cached_property
     def _corrections(self) -> FloatArray:
-        """(K, S + 1) weights of the archive's modes: Gaussian process regression of the errors in them."""
+        """(K, S) weights of the archive's modes: Gaussian process regression of the errors in them."""
         assert self.archive is not None  # noqa: S101 -- predict() asks only then
-        signals, success = self._regressed(self.archive.modes)
-        wrong = np.column_stack([self.archive.signals - signals, self.archive.success - success])
+        wrong = self.archive.signals - self._regressed(self.archive.modes)[0]
         likeness = self._likeness(self.archive.modes, self.archive)
         return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), wrong), np.float64)
 
