@@ -149,23 +149,6 @@ def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like
     assert np.delete(after - before, SPEED, axis=1) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_mode_that_disappoints_is_not_sought_again_where_an_archive_is(surface: ResponseSurface) -> None:
-    wants = likes(speed_m_s=1.0)
-    sure = replace(surface, gram=30 * surface.gram)
-    far = np.array([[-0.5, -0.5, 0.5, 0.5, 0.3]])
-    known = replace(sure, archive=ModeArchive(far, *sure.predict(far)))
-    chosen = best_mode(known, wants, seed=0)
-    expected = known.predict(chosen)[0]
-    less = np.repeat((expected - 0.5 * likes(speed_m_s=1.0))[None], 80, axis=0)
-    learned = known.with_observed(chosen, less, np.ones(80))
-    assert learned.archive
-    assert len(learned.archive.modes) == 2
-    assert learned.predict(chosen)[0][SPEED] < expected[SPEED] - 0.4
-    assert sure.with_observed(chosen, less, np.ones(80)).predict(chosen)[0][SPEED] > expected[SPEED] - 0.4
-    again = best_mode(learned, wants, seed=0)
-    assert np.abs((again - chosen) / (surface.high - surface.low)).max() > 0.1
-
-
 def test_a_surface_of_other_axes_is_refused(surface: ResponseSurface) -> None:
     fewer = replace(FAMILY, axes=FAMILY.axes[:3])
     with pytest.raises(ValueError, match="other signals or axes"):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,20 +35,34 @@ def find_mode(
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
     and the search goes on from there, more careful about success with every trial that was not acceptable. When no
     attempt is acceptable the last mode is weakened; at worst it is off. Where the surface has an archive, the best of
-    that is tried, too (decision 187).
+    that is tried, too, and the best by what it corrects of the surface (decisions 187 and 188).
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals. Of a reward with further
     terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
     started = time.perf_counter()
     wishes = problem.reward.signal_weights(pool.rollouts)
     further = _further(problem, wishes, pool)
-    archive = surface.archive
+    archive, surface = surface.archive, replace(surface, archive=None)
     attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
     if further:
         attempts = enough = problem.config.mode_attempts_beyond_sums
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     tried: list[tuple[GateTrial, FloatArray]] = []
     accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
+
+    def sought_in(surface: ResponseSurface) -> FloatArray:
+        rejected = len(tried) - len(accepted)
+        return best_mode(
+            surface,
+            wishes,
+            problem.seed,
+            caution=_caution(problem),
+            success_caution=problem.config.success_caution * (1 + rejected),
+            further=further.coefficients if further else None,
+        )
+
+    def is_new(mode: FloatArray) -> bool:
+        return bool(mode.any()) and not any(np.array_equal(mode, earlier) for _, earlier in tried)
 
     def driven_in(mode: FloatArray) -> Sequence[Trajectory]:
         trial, driven = try_on(problem, _act_in(problem, off, mode), 1.0, 0.0, reference, collect)
@@ -60,17 +75,8 @@ def find_mode(
         if len(accepted) == enough:
             break
         progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
-        rejected = len(tried) - len(accepted)
-        careful = problem.config.success_caution * (1 + rejected)
-        mode = best_mode(
-            surface,
-            wishes,
-            problem.seed,
-            caution=_caution(problem),
-            success_caution=careful,
-            further=further.coefficients if further else None,
-        )
-        if not mode.any() or any(np.array_equal(mode, earlier) for _, earlier in tried):
+        mode = sought_in(surface)
+        if not is_new(mode):
             break
         progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
         driven = driven_in(mode)
@@ -79,10 +85,11 @@ def find_mode(
     if not tried:
         return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
     sought = tried[-1][1]
-    archived = archive.best(wishes) if archive else None
-    if archived is not None:
-        progress("checking the best mode of the archive on held-out scenarios", 0.31)
-        driven_in(archived)
+    if archive:
+        progress("checking what an archive of modes says on held-out scenarios", 0.31)
+        for archived in (archive.best(wishes), sought_in(replace(surface, archive=archive))):
+            if archived is not None and is_new(archived):
+                driven_in(archived)
     for gate in problem.config.gates if not accepted else ():
         progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
         act = _act_in(problem, off.changed(gate=gate), sought)

@@ -68,12 +68,6 @@ class ModeArchive:
         best = int(np.argmax(returns / unit - SUCCESS_PENALTY * lost))
         return self.modes[best] if returns[best] > 0.0 else None
 
-    def with_tried(self, mode: FloatArray, signals: FloatArray, success: float) -> Self:
-        """With one mode more: (A,), (S,) and its change of success."""
-        return type(self)(
-            np.vstack([self.modes, mode]), np.vstack([self.signals, signals]), np.append(self.success, success)
-        )
-
 
 @dataclass(frozen=True)
 class ResponseSurface:
@@ -144,12 +138,7 @@ class ResponseSurface:
         repeated = np.repeat(_with_one(features[None]), len(successes), axis=0)
         log_odds, precision = _logistic(repeated, successes, self.log_odds, self.precision)
         coefficients = np.asarray(np.linalg.solve(gram, moments), np.float64)
-        tried = self.archive and self.archive.with_tried(
-            mode, signal_deltas.mean(axis=0), float(successes.mean() - expit(self.log_odds[0]))
-        )
-        return replace(
-            self, coefficients=coefficients, gram=gram, log_odds=log_odds, precision=precision, archive=tried
-        )
+        return replace(self, coefficients=coefficients, gram=gram, log_odds=log_odds, precision=precision)
 
     def to_bytes(self) -> bytes:
         """One safetensors file."""
