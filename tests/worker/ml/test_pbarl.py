@@ -185,6 +185,22 @@ def test_a_mode_that_was_tried_for_everybody_is_tried_too_and_taken_if_it_is_bet
     ).weights.mode
 
 
+def test_what_an_archive_says_of_modes_like_its_own_finds_one_that_is_better_than_all_of_them(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    """Nobody of the archive wants it as slow as this person; the surface knows hardly anything, and that is wrong."""
+    slowest = np.array([axis.low if axis.name == "speed_far" else 0.0 for axis in FAMILY.axes])
+    modes = np.outer([0.3, 0.6], slowest)
+    archive = ModeArchive(modes, surface.predict(modes)[0], np.zeros(2))
+    wrong = replace(surface, coefficients=-0.1 * surface.coefficients)
+    found = mode_search.find_mode(
+        problem(-1.0, reference), replace(wrong, archive=archive), Pool(), reference, World().collect
+    )
+    archived = found.trials[CONFIG.mode_attempts]
+    assert found.weights.mode["speed_far"] < 0.75 * slowest.min()
+    assert found.trials[-1].preference > 1.2 * archived.preference > 0.0
+
+
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
     def pressing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         episodes = World().collect(act, scenarios, noise, seed)

@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.exported.filter_act import FilterAct, act_of
+from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import limits_of, untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
@@ -19,6 +19,9 @@ from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards.beyond_sums.terms import RicherReward
 from worker.ml.rewards.reward_models import StructuredReward
+
+CORRECTED_ATTEMPTS = 2
+"""with the surface that an archive corrects, the second more careful about success"""
 
 
 def find_mode(
@@ -40,73 +43,125 @@ def find_mode(
     terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
     started = time.perf_counter()
-    wishes = problem.reward.signal_weights(pool.rollouts)
-    further = _further(problem, wishes, pool)
-    archive, surface = surface.archive, replace(surface, archive=None)
-    attempts, enough = problem.config.mode_attempts, problem.config.modes_to_choose_from
-    if further:
-        attempts = enough = problem.config.mode_attempts_beyond_sums
-    off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
-    tried: list[tuple[GateTrial, FloatArray]] = []
-    accepted: list[tuple[GateTrial, FloatArray, Sequence[Trajectory]]] = []
+    search = _ModeSearch(problem, surface, pool, reference, collect, progress)
+    search.by_surface()
+    if not search.tried:
+        note = "The labels do not yet say clearly what to change; the mode is off."
+        return search.without_mode(note).timed("mode", started)
+    sought = search.tried[-1].mode
+    search.by_archive()
+    if not search.accepted:
+        search.weakened(sought)
+    if not search.accepted:
+        note = "No mode was better while keeping the task and the forces; the mode is off."
+        return search.without_mode(note).timed("mode", started)
+    return search.with_best_mode().timed("mode", started)
 
-    def sought_in(surface: ResponseSurface) -> FloatArray:
-        rejected = len(tried) - len(accepted)
-        return best_mode(
-            surface,
-            wishes,
-            problem.seed,
-            caution=_caution(problem),
-            success_caution=problem.config.success_caution * (1 + rejected),
-            further=further.coefficients if further else None,
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """What came of a mode in the gate's scenarios."""
+
+    mode: FloatArray
+    """(A,)"""
+    trial: GateTrial
+    driven: Sequence[Trajectory]
+
+
+class _ModeSearch:
+    """The trials of one person's modes."""
+
+    def __init__(
+        self,
+        problem: FilterProblem,
+        surface: ResponseSurface,
+        pool: Pool,
+        reference: Sequence[Trajectory],
+        collect: Collect,
+        progress: ReportProgress,
+    ) -> None:
+        self.problem, self.reference, self.collect, self.progress = problem, reference, collect, progress
+        self.archive, self.surface = surface.archive, replace(surface, archive=None)
+        self.wishes = problem.reward.signal_weights(pool.rollouts)
+        self.further = _further(problem, self.wishes, pool)
+        self.off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
+        self.tried: list[_Tried] = []
+        self.accepted: list[_Tried] = []
+
+    def by_surface(self) -> None:
+        """Try what the surface says is best, which learns from every trial."""
+        config = self.problem.config
+        attempts = config.mode_attempts_beyond_sums if self.further else config.mode_attempts
+        enough = attempts if self.further else config.modes_to_choose_from
+        for attempt in range(attempts):
+            if len(self.accepted) == enough:
+                return
+            self.progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
+            mode = self._best_by(self.surface, rejected=len(self.tried) - len(self.accepted))
+            if not self._is_new(mode):
+                return
+            self.progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
+            driven = self._try(mode).driven
+            changes = signal_changes(self.reference, driven)
+            self.surface = self.surface.with_observed(mode, changes, successes(driven))
+            self.further = self.further and self.further.with_observed(mode, self.reference, driven)
+
+    def by_archive(self) -> None:
+        """Try the best of the archive, and what is best by the surface that it corrects."""
+        if not self.archive:
+            return
+        self.progress("checking what an archive of modes says on held-out scenarios", 0.31)
+        best, corrected = self.archive.best(self.wishes), replace(self.surface, archive=self.archive)
+        if best is not None and self._is_new(best):
+            self._try(best)
+        for rejected in range(CORRECTED_ATTEMPTS):
+            mode = self._best_by(corrected, rejected)
+            if self._is_new(mode) and self._try(mode) in self.accepted:
+                return
+
+    def weakened(self, mode: FloatArray) -> None:
+        """Try less and less of a mode that was not acceptable."""
+        for gate in self.problem.config.gates:
+            self.progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
+            if self._try(mode, gate) in self.accepted:
+                return
+
+    def with_best_mode(self) -> FilterDraft:
+        """The mode that is best by the learned return among those that were acceptable."""
+        best = max(self.accepted, key=lambda each: each.trial.preference)
+        trials = (*(each.trial for each in self.tried if each is not best), best.trial)
+        task = self.problem.task
+        weights = self.off.changed(mode=task.modes.named(best.mode), gate=best.trial.gate)
+        return FilterDraft(
+            weights, trials=trials, tested=limits_of(task.observation, task.action, best.driven, self.reference)
         )
 
-    def is_new(mode: FloatArray) -> bool:
-        return bool(mode.any()) and not any(np.array_equal(mode, earlier) for _, earlier in tried)
+    def without_mode(self, note: str) -> FilterDraft:
+        """The reference policy, and why."""
+        return FilterDraft(self.off, trials=tuple(each.trial for each in self.tried), notes=(note,))
 
-    def driven_in(mode: FloatArray) -> Sequence[Trajectory]:
-        trial, driven = try_on(problem, _act_in(problem, off, mode), 1.0, 0.0, reference, collect)
-        tried.append((trial, mode))
-        if acceptable(problem, trial, reference):
-            accepted.append((trial, mode, driven))
-        return driven
+    def _best_by(self, surface: ResponseSurface, rejected: int) -> FloatArray:
+        return best_mode(
+            surface,
+            self.wishes,
+            self.problem.seed,
+            caution=_caution(self.problem),
+            success_caution=self.problem.config.success_caution * (1 + rejected),
+            further=self.further.coefficients if self.further else None,
+        )
 
-    for attempt in range(attempts):
-        if len(accepted) == enough:
-            break
-        progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
-        mode = sought_in(surface)
-        if not is_new(mode):
-            break
-        progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
-        driven = driven_in(mode)
-        surface = surface.with_observed(mode, signal_changes(reference, driven), successes(driven))
-        further = further.with_observed(mode, reference, driven) if further else None
-    if not tried:
-        return _without_mode(off, "The labels do not yet say clearly what to change; the mode is off.", [], started)
-    sought = tried[-1][1]
-    if archive:
-        progress("checking what an archive of modes says on held-out scenarios", 0.31)
-        for archived in (archive.best(wishes), sought_in(replace(surface, archive=archive))):
-            if archived is not None and is_new(archived):
-                driven_in(archived)
-    for gate in problem.config.gates if not accepted else ():
-        progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
-        act = _act_in(problem, off.changed(gate=gate), sought)
-        weakened, driven = try_on(problem, act, gate, 0.0, reference, collect)
-        tried.append((weakened, sought))
-        if acceptable(problem, weakened, reference):
-            accepted = [(*tried[-1], driven)]
-            break
-    trials = [trial for trial, _ in tried]
-    if not accepted:
-        note = "No mode was better while keeping the task and the forces; the mode is off."
-        return _without_mode(off, note, trials, started)
-    chosen, mode, driven = max(accepted, key=lambda each: each[0].preference)
-    weights = off.changed(mode=problem.task.modes.named(mode), gate=chosen.gate)
-    ordered = (*(trial for trial in trials if trial is not chosen), chosen)
-    tested = limits_of(problem.task.observation, problem.task.action, driven, reference)
-    return FilterDraft(weights, trials=ordered, tested=tested).timed("mode", started)
+    def _is_new(self, mode: FloatArray) -> bool:
+        return bool(mode.any()) and not any(np.array_equal(mode, each.mode) for each in self.tried)
+
+    def _try(self, mode: FloatArray, gate: float = 1.0) -> _Tried:
+        modes = self.problem.task.modes
+        weights = self.off.changed(mode=modes.named(mode), gate=gate)
+        act = act_of(modes, self.problem.policy, weights)
+        tried = _Tried(mode, *try_on(self.problem, act, gate, 0.0, self.reference, self.collect))
+        self.tried.append(tried)
+        if acceptable(self.problem, tried.trial, self.reference):
+            self.accepted.append(tried)
+        return tried
 
 
 def _further(problem: FilterProblem, wishes: FloatArray, pool: Pool) -> FurtherSurface | None:
@@ -120,12 +175,3 @@ def _caution(problem: FilterProblem) -> float:
     """About what members disagree on: only where the reward model's prior has nobody whom the person may be like."""
     knows_people = isinstance(problem.reward, StructuredReward) and not problem.task.is_a_labs
     return 0.0 if knows_people else CAUTION
-
-
-def _act_in(problem: FilterProblem, weights: FilterWeights, mode: FloatArray) -> FilterAct:
-    named = problem.task.modes.named(mode)
-    return act_of(problem.task.modes, problem.policy, weights.changed(mode=named))
-
-
-def _without_mode(off: FilterWeights, note: str, trials: Sequence[GateTrial], started: float) -> FilterDraft:
-    return FilterDraft(off, trials=tuple(trials), notes=(note,)).timed("mode", started)
