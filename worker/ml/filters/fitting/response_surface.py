@@ -6,7 +6,6 @@ same scenario. Given a person's weights on the signals, their best mode is then 
 
 import json
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -103,7 +102,7 @@ class ResponseSurface:
         signals, success = self._regressed(at, caution)
         if self.archive is None:
             return signals, success
-        return signals + self._likeness(at, self.archive) @ self._corrections, success
+        return signals + self._likeness(at, self.archive) @ self._corrections(self.archive), success
 
     def _regressed(self, modes: FloatArray, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         features = monomials(modes)
@@ -112,12 +111,10 @@ class ResponseSurface:
         change = features @ self.log_odds[1:] - caution * deviation
         return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
 
-    @cached_property
-    def _corrections(self) -> FloatArray:
+    def _corrections(self, archive: ModeArchive) -> FloatArray:
         """(K, S) weights of the archive's modes: Gaussian process regression of the errors in them."""
-        assert self.archive is not None  # noqa: S101 -- predict() asks only then
-        wrong = self.archive.signals - self._regressed(self.archive.modes)[0]
-        likeness = self._likeness(self.archive.modes, self.archive)
+        wrong = archive.signals - self._regressed(archive.modes)[0]
+        likeness = self._likeness(archive.modes, archive)
         return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), wrong), np.float64)
 
     def _likeness(self, modes: FloatArray, archive: ModeArchive) -> FloatArray:
