@@ -12,6 +12,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,12 @@ def _run(
         **seconds,
         "seconds": round(marks[-1] - marks[0], 1),
         "success_delta": round(evaluation["success"]["delta"], 3),
+        "promise_tests": ", ".join(_in_words(test) for test in draft.promise["tests"]),
     }
+
+
+def _in_words(test: Mapping[str, Any]) -> str:
+    return f"{test['harmed']} of {test['scenarios']} at {test['strength']:.0%}"
 
 
 def _no_beat() -> None:
