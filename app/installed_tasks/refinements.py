@@ -5,7 +5,7 @@ SHORTEST_REFINEMENT = 8_000
 SHARE_AHEAD = 0.9
 """of the steps, made while the person still answers"""
 ANSWERS_AHEAD = 50
-"""which that part follows; with 25 of a hundred less was gained (docs/results/rivals.md)"""
+"""which that part follows; with 25 of a hundred less was gained (docs/results/how_the_refinement_was_found.md)"""
 
 
 def none_or_enough(steps: int) -> int:

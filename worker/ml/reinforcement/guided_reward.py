@@ -36,7 +36,7 @@ def guided(
     Distance and strokes in standard deviations over reference rollouts. A critic that is asked for a policy's value
     does not know that episodes end: without the latter strokes that come too late cost nothing. R-hat forgives a blow
     that is short; so force has a price where it is more than 95 of 100 reference episodes reach (decision 162;
-    docs/results/rivals.md).
+    docs/results/how_the_refinement_was_found.md).
     """
     approaching = sketchy(reference, learned)
     unit = float(np.concatenate([each.signals[:, _STROKES] for each in reference]).std())
