@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.installed_tasks import catalogue
 from worker.__main__ import main
 from worker.compute import simulation
 from worker.experiments import archive_modes
@@ -41,6 +42,19 @@ def test_what_modes_changed_is_kept_beside_the_surface_and_driven_once(
     monkeypatch.setattr(archive_modes, "run_blocks", lambda compute, blocks, what: assert_all_there(blocks))
     archive_modes.archive(TASK.name, work, 1, people=2, scenarios=BLOCK)
     assert file.read_bytes() == written
+
+
+@pytest.mark.parametrize("name", catalogue.names())
+def test_every_task_ships_with_an_archive_and_its_record(name: str) -> None:
+    file, task = simulation.surface_file(name), registry.task(name)
+    surface = ResponseSurface.load(file, task.modes, task.signals)
+    record = json.loads(file.with_suffix(".json").read_text())["archive"]
+    assert surface.archive
+    assert len(surface.archive.modes) == record["modes"]
+    assert surface.archive.success.mean() == pytest.approx(record["success_delta"], abs=1e-4)
+    assert (surface.low <= surface.archive.modes).all()
+    assert (surface.archive.modes <= surface.high).all()
+    assert surface.archive.modes.any(axis=1).all(), "nobody's mode is the reference policy"
 
 
 def test_a_task_that_was_not_explored_is_told_what_to_do(
