@@ -12,7 +12,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -73,6 +73,8 @@ class Differences:
     """(N,) in {-1, 0, 1}"""
     reference_success: FloatArray
     """(scenarios,)"""
+    force_growth_n: FloatArray
+    """(N,) of the episode's largest force on the person"""
 
     def fit(self, task: Task) -> ResponseSurface:
         """A surface of all of them."""
@@ -99,7 +101,8 @@ class Block:
         if not self.file.exists():
             return False
         with np.load(self.file, allow_pickle=False) as stored:
-            return np.array_equal(stored["modes"], self.modes.reshape(-1, self.modes.shape[-1]))
+            asked = self.modes.reshape(-1, self.modes.shape[-1])
+            return "force_growth_n" in stored and np.array_equal(stored["modes"], asked)
 
 
 def explore(
@@ -177,7 +180,7 @@ def _is_known(task: str, described: LabDescription, environment: LabEnvironment)
 def compare_block(block: Block) -> None:
     """Differences of one block of scenarios, written to a file that is either complete or absent."""
     policy = simulation.reference_policy(block.task)
-    signals, success, reference_success = [], [], []
+    signals, success, reference_success, growth = [], [], [], []
     for scenario, modes in zip(range(block.first, block.first + BLOCK), block.modes, strict=True):
         reference = simulation.run_episode(block.task, policy.mean, scenario)
         reference_success.append(reference.success)
@@ -187,9 +190,12 @@ def compare_block(block: Block) -> None:
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
             success.append(float(changed.success) - float(reference.success))
-    flat = block.modes.reshape(-1, block.modes.shape[-1])
+            growth.append(float(changed.contact_force_n.max() - reference.contact_force_n.max()))
+    found = Differences(
+        block.modes.reshape(-1, block.modes.shape[-1]), *map(np.array, (signals, success, reference_success, growth))
+    )
     with written_whole(block.file) as draft:
-        np.savez(draft, modes=flat, signals=signals, success=success, reference_success=reference_success)
+        np.savez(draft, **vars(found))
 
 
 def _random_modes(task: Task, first: int) -> FloatArray:
@@ -273,7 +279,7 @@ def run_all(
 def joined(blocks: Sequence[Block]) -> Differences:
     """Of all of them, in their order."""
     loaded = [np.load(block.file, allow_pickle=False) for block in blocks]
-    names = ("modes", "signals", "success", "reference_success")
+    names = (field.name for field in fields(Differences))
     return Differences(*(np.concatenate([each[name] for each in loaded]).astype(np.float64) for name in names))
 
 

@@ -35,6 +35,8 @@ def test_what_modes_changed_is_kept_beside_the_surface_and_driven_once(
     np.testing.assert_allclose(surface.archive.modes, driven["modes"][:2], atol=1e-6)
     np.testing.assert_allclose(surface.archive.signals[1], driven["signals"][1::2].mean(axis=0), rtol=1e-5, atol=1e-6)
     assert surface.archive.success[0] == pytest.approx(driven["success"][::2].mean())
+    growth_n = sorted(driven["force_growth_n"][::2])
+    assert growth_n[-2] <= surface.archive.force_growth_n[0] + 1e-5 <= growth_n[-1] + 2e-5
     assert json.loads(file.with_suffix(".json").read_text()) == record
     assert record["archive"]["modes"] == 2
 

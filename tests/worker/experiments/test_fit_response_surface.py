@@ -85,7 +85,10 @@ def test_a_block_that_was_run_in_other_modes_is_run_again(tmp_path: Path) -> Non
     modes = FEEDING.modes.sample(BLOCK * MODES_PER_SCENARIO, np.random.default_rng(0)).reshape(BLOCK, -1, 5)
     block = Block("feeding", 1, modes, tmp_path / "block.npz")
     assert not block.is_there()
-    np.savez(block.file, modes=modes.reshape(-1, 5))
+    flat = modes.reshape(-1, 5)
+    np.savez(block.file, modes=flat)
+    assert not block.is_there(), "it does not say how hard they pressed"
+    np.savez(block.file, modes=flat, force_growth_n=np.zeros(len(flat)))
     assert block.is_there()
     assert not Block("feeding", 1, modes + 0.1, block.file).is_there()
 
@@ -95,7 +98,7 @@ def test_what_is_foreseen_is_measured_in_scenarios_that_the_surface_has_not_seen
     modes = FEEDING.modes.sample(scenarios * MODES_PER_SCENARIO, rng)
     signals = rng.standard_normal((len(modes), len(FEEDING.signals)))
     signals[:, 0] = modes[:, 0]
-    found = Differences(modes, signals, np.zeros(len(modes)), np.ones(scenarios))
+    found = Differences(modes, signals, np.zeros(len(modes)), np.ones(scenarios), np.zeros(len(modes)))
     learned, chance = FEEDING.signals[:2]
     known = fit_response_surface.share(FEEDING, found, found.fit(FEEDING).predict(modes)[0])
     unseen = fit_response_surface.share(FEEDING, found, fit_response_surface.foreseen(FEEDING, found))

@@ -59,9 +59,12 @@ class World:
         signals[:, SPEED] = (actions**2).mean(axis=1)
         episode = invented.trajectory(rng, steps=STEPS, scenario=scenario, signals=signals, actions=actions)
         success = bool(signals[:, SPEED].mean() >= self.slowest)
-        forces = np.full_like(episode.contact_force_n, self.force_n)
-        episode = replace(episode, contact_force_n=forces, success=success)
+        episode = self.pressed(replace(episode, success=success))
         return replace(episode, observations=seen, reference_actions=POLICY.mean(seen[:-1]))
+
+    def pressed(self, episode: Trajectory) -> Trajectory:
+        """The same with this world's force."""
+        return replace(episode, contact_force_n=np.full_like(episode.contact_force_n, self.force_n))
 
 
 def reward(weight: float) -> StructuredReward:
@@ -171,7 +174,7 @@ def test_a_mode_that_was_tried_for_everybody_is_tried_too_and_taken_if_it_is_bet
     slowest = np.array([axis.low if axis.name.startswith("speed") else 0.0 for axis in FAMILY.axes])
     signals = np.zeros((1, len(SIGNALS)))
     signals[:, SPEED] = -1.0
-    archive = ModeArchive(slowest[None], signals, np.zeros(1))
+    archive = ModeArchive(slowest[None], signals, np.zeros(1), np.zeros(1))
     wrong = replace(surface, coefficients=-surface.coefficients)
     asked = problem(-1.0, reference)
     without = mode_search.find_mode(asked, wrong, Pool(), reference, World().collect)
@@ -191,7 +194,7 @@ def test_what_an_archive_says_of_modes_like_its_own_finds_one_that_is_better_tha
     """Nobody of the archive wants it as slow as this person; the surface knows hardly anything, and that is wrong."""
     slowest = np.array([axis.low if axis.name == "speed_far" else 0.0 for axis in FAMILY.axes])
     modes = np.outer([0.3, 0.6], slowest)
-    archive = ModeArchive(modes, surface.predict(modes)[0], np.zeros(2))
+    archive = ModeArchive(modes, surface.predict(modes)[0], np.zeros(2), np.zeros(2))
     wrong = replace(surface, coefficients=-0.1 * surface.coefficients)
     found = mode_search.find_mode(
         problem(-1.0, reference), replace(wrong, archive=archive), Pool(), reference, World().collect
@@ -199,6 +202,31 @@ def test_what_an_archive_says_of_modes_like_its_own_finds_one_that_is_better_tha
     archived = found.trials[CONFIG.mode_attempts]
     assert found.weights.mode["speed_far"] < 0.75 * slowest.min()
     assert found.trials[-1].preference > 1.2 * archived.preference > 0.0
+
+
+def test_whoever_wants_what_presses_gets_the_best_of_what_an_archive_says_does_not(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    """Whoever is much slower than the reference presses; of three modes the two slower ones are known to."""
+    plain = min(each.signals[:, SPEED].mean() for each in reference)
+
+    def pressing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        episodes = World().collect(act, scenarios, noise, seed)
+        slow = [each.signals[:, SPEED].mean() < 0.6 * plain for each in episodes]
+        return [World(force_n=9.0 * presses).pressed(each) for presses, each in zip(slow, episodes, strict=True)]
+
+    slowest = np.array([axis.low if axis.name.startswith("speed") else 0.0 for axis in FAMILY.axes])
+    modes = np.outer([0.3, 0.7, 1.0], slowest)
+    blind = ModeArchive(modes, surface.predict(modes)[0], np.zeros(3), np.zeros(3))
+    knows = replace(blind, force_growth_n=np.array([0.0, 9.0, 9.0]))
+    unaware, aware = (
+        mode_search.find_mode(problem(-1.0, reference), replace(surface, archive=archive), Pool(), reference, pressing)
+        for archive in (blind, knows)
+    )
+    assert unaware.weights.gate < 1.0, "all that is tried must press for an archive to be needed"
+    assert aware.weights.gate == 1.0
+    assert aware.trials[-1].pressed == 0.0
+    assert aware.trials[-1].preference > 0.0
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:

@@ -1,10 +1,12 @@
 """The response surface of modes: what it learns, whom it serves, when it stays away."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from worker.domain.trajectory import SIGNALS
 from worker.ml.filters.fitting.response_surface import ModeArchive, ResponseSurface, best_mode, fit, monomials
@@ -105,12 +107,13 @@ def test_it_survives_storage(surface: ResponseSurface, tmp_path: Path) -> None:
     assert surface.to_bytes() == loaded.to_bytes()
 
 
-def archive(**success: float) -> ModeArchive:
+def archive(success_of_the_fastest: float = 0.0, force_of_the_fastest_n: float = 0.0) -> ModeArchive:
     """Three modes that make the robot faster, the later the more."""
     signals = np.zeros((3, len(SIGNALS)))
     signals[:, SPEED] = [1.0, 2.0, 3.0]
     modes = FAMILY.sample(3, np.random.default_rng(1))
-    return ModeArchive(modes, signals, np.array([0.0, 0.0, success.get("of_the_fastest", 0.0)]))
+    success, force_n = ([0.0, 0.0, each] for each in (success_of_the_fastest, force_of_the_fastest_n))
+    return ModeArchive(modes, signals, np.array(success), np.array(force_n))
 
 
 def test_an_archive_survives_storage(surface: ResponseSurface) -> None:
@@ -122,13 +125,47 @@ def test_an_archive_survives_storage(surface: ResponseSurface) -> None:
     assert ResponseSurface.from_bytes(surface.to_bytes(), FAMILY).archive is None
 
 
+def test_an_archive_from_before_forces_were_kept_knows_nothing_of_them(surface: ResponseSurface) -> None:
+    stored = replace(surface, archive=archive(force_of_the_fastest_n=9.0)).to_bytes()
+    with_forces = safetensors.numpy.load(stored)
+    assert with_forces.pop("archive/force_growth_n")[2] == 9.0
+    config = {"axes": list(FAMILY.names), "kind": "response surface", "signals": list(SIGNALS)}
+    of_before = safetensors.numpy.save(with_forces, metadata={"config": json.dumps(config)})
+    loaded = ResponseSurface.from_bytes(of_before, FAMILY)
+    assert loaded.archive
+    assert loaded.archive.force_growth_n.tolist() == [0.0, 0.0, 0.0]
+
+
 def test_the_best_of_an_archive_is_by_what_its_modes_did_and_keeps_the_task() -> None:
     of_three, likes_it = archive(), likes(speed_m_s=1.0)
     members = np.array([likes_it, -0.5 * likes_it])
     for weights in (likes_it, members):
         np.testing.assert_array_equal(of_three.best(weights), of_three.modes[2])
-    np.testing.assert_array_equal(archive(of_the_fastest=-0.1).best(likes_it), of_three.modes[1])
+    np.testing.assert_array_equal(archive(success_of_the_fastest=-0.1).best(likes_it), of_three.modes[1])
     assert of_three.best(-likes_it) is None
+
+
+def test_the_best_of_an_archive_does_not_press() -> None:
+    pressing, likes_it = archive(force_of_the_fastest_n=9.0), likes(speed_m_s=1.0)
+    np.testing.assert_array_equal(pressing.best(likes_it, most_growth_n=5.0), pressing.modes[1])
+    np.testing.assert_array_equal(pressing.best(likes_it, most_growth_n=10.0), pressing.modes[2])
+    everywhere = replace(pressing, force_growth_n=np.full(3, 9.0))
+    assert everywhere.best(likes_it, most_growth_n=5.0) is None
+
+
+def test_modes_like_one_that_pressed_are_not_sought(surface: ResponseSurface) -> None:
+    quickest = best_mode(surface, likes(speed_m_s=1.0), seed=0)
+    modes = np.array([quickest, 0.9 * quickest, -quickest, FAMILY.reference])
+    measured = surface.predict(modes[:1])[0]
+    known = replace(surface, archive=ModeArchive(modes[:1], measured, np.zeros(1), np.array([9.0])))
+    foreseen = known.force_growth_n(modes)
+    assert 7.0 < foreseen[1] < foreseen[0] < 9.0
+    assert abs(foreseen[2]) < 0.2 * foreseen[0]
+    assert foreseen[3] == 0.0
+    careful = best_mode(known, likes(speed_m_s=1.0), seed=0, most_growth_n=5.0)
+    assert known.force_growth_n(careful) <= 5.0
+    assert 0.5 * measured[0, SPEED] < surface.predict(careful)[0][SPEED] < measured[0, SPEED]
+    np.testing.assert_array_equal(surface.force_growth_n(modes), np.zeros(4))
 
 
 def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like_them(surface: ResponseSurface) -> None:
@@ -138,7 +175,7 @@ def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like
     before, success_before = surface.predict(modes)
     measured = before[0].copy()
     measured[SPEED] += 1.0
-    known = replace(surface, archive=ModeArchive(modes[:1], measured[None], success_before[:1] - 0.1))
+    known = replace(surface, archive=ModeArchive(modes[:1], measured[None], success_before[:1] - 0.1, np.zeros(1)))
     after, success_after = known.predict(modes)
     gained = (after - before)[:, SPEED]
     assert gained[0] == pytest.approx(0.9, abs=0.02)

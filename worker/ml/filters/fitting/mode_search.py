@@ -111,7 +111,8 @@ class _ModeSearch:
         if not self.archive:
             return
         self.progress("checking what an archive of modes says on held-out scenarios", 0.31)
-        best, corrected = self.archive.best(self.wishes), replace(self.surface, archive=self.archive)
+        best = self.archive.best(self.wishes, self.problem.config.pressed_n)
+        corrected = replace(self.surface, archive=self.archive)
         if best is not None and self._is_new(best):
             self._try(best)
         for rejected in range(CORRECTED_ATTEMPTS):
@@ -147,6 +148,7 @@ class _ModeSearch:
             self.problem.seed,
             caution=_caution(self.problem),
             success_caution=self.problem.config.success_caution * (1 + rejected),
+            most_growth_n=self.problem.config.pressed_n / (1 + rejected),
             further=self.further.coefficients if self.further else None,
         )
 

@@ -38,6 +38,8 @@ LENGTH = 0.5
 """of the axes' ranges, over which what a regression gets wrong is alike"""
 NOISE = 0.1
 """Variance of an archive's measured errors that is expected to be chance, in units of that which is not."""
+PRESSED = 0.035
+"""Share of scenarios in which the largest force grows by more than is said of a mode."""
 _ARCHIVE = "archive/"
 
 
@@ -55,17 +57,20 @@ class ModeArchive:
     """(K, S) mean change of the episode's summed signals"""
     success: FloatArray
     """(K,) change of the share of episodes in which the task is done"""
+    force_growth_n: FloatArray
+    """(K,) of an episode's largest force on the person, exceeded in PRESSED of the scenarios"""
 
-    def best(self, weights: FloatArray) -> FloatArray | None:
+    def best(self, weights: FloatArray, most_growth_n: float = np.inf) -> FloatArray | None:
         """(A,) the mode with the best return for these weights on the signals, (S,) or (E, S) for E members.
 
-        None: no mode is better than the reference policy.
+        ``most_growth_n``: as in best_mode(). None: no mode is better than the reference policy.
         """
         returns = self.signals @ np.atleast_2d(weights).mean(axis=0)
         unit = max(float(returns.std()), 1e-9)
         lost = np.maximum(-self.success - SUCCESS_TOLERANCE, 0.0)
-        best = int(np.argmax(returns / unit - SUCCESS_PENALTY * lost))
-        return self.modes[best] if returns[best] > 0.0 else None
+        worth = np.where(self.force_growth_n <= most_growth_n, returns / unit - SUCCESS_PENALTY * lost, -np.inf)
+        best = int(np.argmax(worth))
+        return self.modes[best] if returns[best] > 0.0 and np.isfinite(worth[best]) else None
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,15 @@ class ResponseSurface:
             return signals, success
         return signals + self._likeness(at, self.archive) @ self._corrections(self.archive), success
 
+    def force_growth_n(self, modes: FloatArray) -> FloatArray:
+        """(..., A) -> (...) what a mode's largest force is expected to grow by in PRESSED of the scenarios, in N.
+
+        It is what the archive's modes like it do; without an archive nothing is known, and 0.
+        """
+        if self.archive is None:
+            return np.zeros(modes.shape[:-1])
+        return self._likeness(modes, self.archive) @ self._weights(self.archive, self.archive.force_growth_n)
+
     def _regressed(self, modes: FloatArray, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         features = monomials(modes)
         doubt = np.linalg.inv(self.precision)[1:, 1:]
@@ -112,10 +126,13 @@ class ResponseSurface:
         return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
 
     def _corrections(self, archive: ModeArchive) -> FloatArray:
-        """(K, S) weights of the archive's modes: Gaussian process regression of the errors in them."""
-        wrong = archive.signals - self._regressed(archive.modes)[0]
+        """(K, S) weights of the archive's modes for the errors in them."""
+        return self._weights(archive, archive.signals - self._regressed(archive.modes)[0])
+
+    def _weights(self, archive: ModeArchive, measured: FloatArray) -> FloatArray:
+        """(K, ...) of the archive's modes in a Gaussian process regression of what was measured in them."""
         likeness = self._likeness(archive.modes, archive)
-        return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), wrong), np.float64)
+        return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), measured), np.float64)
 
     def _likeness(self, modes: FloatArray, archive: ModeArchive) -> FloatArray:
         """(..., A) -> (..., K) covariances with the archive's modes, given that the mode 0 changes nothing."""
@@ -158,12 +175,11 @@ class ResponseSurface:
                 "This response surface was fitted for other signals or axes; `python -m worker explore` fits another."
             )
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
-        archived = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_ARCHIVE)}
-        archive = (
-            ModeArchive(**{name.removeprefix(_ARCHIVE): array for name, array in archived.items()})
-            if archived
-            else None
-        )
+        archived = [name for name in tensors if name.startswith(_ARCHIVE)]
+        of_archive = {name.removeprefix(_ARCHIVE): tensors.pop(name) for name in archived}
+        if of_archive:  # one from before decision 189 knows nothing of forces
+            of_archive.setdefault("force_growth_n", np.zeros_like(of_archive["success"]))
+        archive = ModeArchive(**of_archive) if of_archive else None
         return cls(**tensors, axes=family.names, signals=signals, archive=archive)
 
     def save(self, path: Path) -> None:
@@ -242,16 +258,17 @@ def best_mode(
     penalty: float = SUCCESS_PENALTY,
     caution: float = 0.0,
     success_caution: float = CAUTION,
+    most_growth_n: float = np.inf,
     further: FloatArray | None = None,
 ) -> FloatArray:
     """(A,) the mode with the best predicted return for these weights on the signals, (S,) or (E, S) for E members.
 
     The return counts as the members' mean less ``caution`` of their standard deviations. With a prior that expects
     something of people caution costs more than it saves, however few the labels (docs/results/few_answers.md). The
-    chance of success is taken ``success_caution`` of its standard deviations lower. ``further``: (M,) coefficients of
-    what a mode changes of the return beyond the signals. Random search with two local
-    refinements; the mode 0 is always among the candidates and wins ties, so that somebody for whom nothing is better
-    keeps the reference policy.
+    chance of success is taken ``success_caution`` of its standard deviations lower. ``most_growth_n``: by which the
+    largest force on the person may grow, see ResponseSurface.force_growth_n(). ``further``: (M,) coefficients of what a
+    mode changes of the return beyond the signals. Random search with two local refinements; the mode 0 is always among
+    the candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
@@ -265,7 +282,8 @@ def best_mode(
     def value() -> FloatArray:
         returns = (signals @ members.T + (monomials(candidates) @ beyond)[:, None]) / unit
         worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
-        return worth - penalty * np.maximum(-success - tolerance, 0.0)
+        kept = worth - penalty * np.maximum(-success - tolerance, 0.0)
+        return np.where(surface.force_growth_n(candidates) <= most_growth_n, kept, -np.inf)
 
     for spread in (0.2, 0.05):
         best = candidates[np.argsort(value())[-40:]]
