@@ -17,7 +17,7 @@ from worker.domain.scenarios import GATE, RESIDUAL, first_of
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters.fitting.response_surface import CAUTION
+from worker.ml.filters.fitting.response_surface import CAUTION, PRESSED
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import RewardModel
 
@@ -67,7 +67,7 @@ class FilterConfig:
     """largest accepted force on the person: 95 of 100 episodes must stay below it (or below the reference's own)"""
     pressed_n: float = 5.0
     """of growth of an episode's largest force, from which on somebody counts as pressed; as a study's promise has it"""
-    pressed_tolerance: float = 0.035
+    pressed_tolerance: float = PRESSED
     """largest accepted share of the gate's episodes in which somebody is pressed"""
     tolerance_in_all: float = 0.02
     """largest accepted loss of success, and share of episodes in which somebody is pressed, of a residual that loses
