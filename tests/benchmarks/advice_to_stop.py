@@ -27,13 +27,8 @@ from tests.benchmarks.answering import Bench, Chain, Variant
 from worker.analysis.comparison import result_pages
 from worker.analysis.wilson import wilson_interval
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.fitting.response_surface import (
-    CAUTION,
-    SUCCESS_PENALTY,
-    SUCCESS_TOLERANCE,
-    ResponseSurface,
-    best_mode,
-)
+from worker.ml.filters.fitting.mode_worth import price_of_failures
+from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.stopping import CANDIDATES, relative_regret
 
 COUNTS = (*range(10, 101, 10), *range(120, 201, 20))
@@ -109,7 +104,7 @@ def regret_in_deviations(surface: ResponseSurface, members: FloatArray) -> float
     """What the advice went by before: each member's regret in standard deviations of its returns over all modes."""
     drawn = np.random.default_rng(0).uniform(surface.low, surface.high, (CANDIDATES, len(surface.low)))
     signals, success = surface.predict(np.concatenate([np.zeros((1, drawn.shape[1])), drawn]), CAUTION)
-    lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
+    lost = price_of_failures(success)
     returns = signals @ members.T
     unit = float((signals @ members.mean(axis=0)).std())
     chosen = int(np.argmax((returns.mean(axis=1) - CAUTION * returns.std(axis=1)) / unit - lost))

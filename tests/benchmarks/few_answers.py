@@ -34,13 +34,8 @@ from worker.domain.responses import TARGETS
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.fitting.response_surface import (
-    CAUTION,
-    SUCCESS_PENALTY,
-    SUCCESS_TOLERANCE,
-    ResponseSurface,
-    best_mode,
-)
+from worker.ml.filters.fitting.mode_worth import price_of_failures
+from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.prior import Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED
@@ -239,7 +234,7 @@ def cautious_mode(surface: ResponseSurface, members: FloatArray, seed: int) -> F
     def worth(modes: FloatArray) -> FloatArray:
         signals, success = surface.predict(modes, CAUTION)
         returns = signals @ members.T / unit
-        lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
+        lost = price_of_failures(success)
         value: FloatArray = returns.mean(axis=-1) - returns.std(axis=-1) - lost
         return value
 

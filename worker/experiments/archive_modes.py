@@ -17,7 +17,8 @@ from worker.compute import simulation
 from worker.compute.pools import Compute
 from worker.domain.scenarios import MODE_ARCHIVE, first_of
 from worker.experiments.fit_response_surface import BLOCK, Block, joined, run_all, run_blocks, somebody
-from worker.ml.filters.fitting.response_surface import PRESSED, ModeArchive, ResponseSurface, best_mode
+from worker.ml.filters.fitting.mode_archive import ModeArchive, tail_growth_n
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.tasks import registry
 
 PEOPLE = 96
@@ -58,7 +59,7 @@ def archive(
     found = joined(blocks)
     signals = found.signals.reshape(scenarios, people, -1).mean(axis=0)
     success = found.success.reshape(scenarios, people).mean(axis=0)
-    growth = np.quantile(found.force_growth_n.reshape(scenarios, people), 1.0 - PRESSED, axis=0)
+    growth = tail_growth_n(found.force_growth_n.reshape(scenarios, people))
     replace(surface, archive=ModeArchive(modes, signals, success, growth)).save(file)
     record: dict[str, Any] = json.loads(file.with_suffix(".json").read_text())
     record["archive"] = {

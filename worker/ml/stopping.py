@@ -9,7 +9,8 @@ the regret to zero; a regret that is small already is not worth anybody's time.
 import numpy as np
 
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.fitting.response_surface import CAUTION, SUCCESS_PENALTY, SUCCESS_TOLERANCE, ResponseSurface
+from worker.ml.filters.fitting.mode_worth import price_of_failures
+from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface
 
 CANDIDATES = 4_000
 """Modes that are tried, the same for every member and at every retraining."""
@@ -30,7 +31,7 @@ def relative_regret(surface: ResponseSurface, members: FloatArray) -> float:
     drawn = rng.uniform(surface.low, surface.high, (CANDIDATES, len(surface.low)))
     modes = np.concatenate([np.zeros((1, drawn.shape[1])), drawn])  # the first is the reference policy, worth 0
     signals, success = surface.predict(modes, CAUTION)
-    lost = SUCCESS_PENALTY * np.maximum(-success - SUCCESS_TOLERANCE, 0.0)
+    lost = price_of_failures(success)
     unit = max(float((signals @ members.mean(axis=0)).std()), 1e-9)
     returns = signals @ members.T / unit  # (modes, E)
     worth = returns - lost[:, None]

@@ -19,9 +19,10 @@ from worker.ml.filters.fitting import mode_search, pbarl, residual, response_sur
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import trial_of, try_on
+from worker.ml.filters.fitting.mode_archive import ModeArchive
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.residual import learn_round
-from worker.ml.filters.fitting.response_surface import ModeArchive, ResponseSurface
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.reward_models import UNDONE, StructuredReward
 
 POLICY = invented.small_policy()

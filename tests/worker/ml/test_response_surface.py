@@ -9,7 +9,8 @@ import pytest
 import safetensors.numpy
 
 from worker.domain.trajectory import SIGNALS
-from worker.ml.filters.fitting.response_surface import ModeArchive, ResponseSurface, best_mode, fit, monomials
+from worker.ml.filters.fitting.mode_archive import ModeArchive, tail_growth_n
+from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode, fit, monomials
 from worker.tasks.feeding.environment import FEEDING
 
 FAMILY = FEEDING.modes
@@ -125,15 +126,12 @@ def test_an_archive_survives_storage(surface: ResponseSurface) -> None:
     assert ResponseSurface.from_bytes(surface.to_bytes(), FAMILY).archive is None
 
 
-def test_an_archive_from_before_forces_were_kept_knows_nothing_of_them(surface: ResponseSurface) -> None:
-    stored = replace(surface, archive=archive(force_of_the_fastest_n=9.0)).to_bytes()
-    with_forces = safetensors.numpy.load(stored)
-    assert with_forces.pop("archive/force_growth_n")[2] == 9.0
+def test_an_archive_from_before_forces_were_kept_is_not_used(surface: ResponseSurface) -> None:
+    with_forces = safetensors.numpy.load(replace(surface, archive=archive()).to_bytes())
+    del with_forces["archive/force_growth_n"]
     config = {"axes": list(FAMILY.names), "kind": "response surface", "signals": list(SIGNALS)}
     of_before = safetensors.numpy.save(with_forces, metadata={"config": json.dumps(config)})
-    loaded = ResponseSurface.from_bytes(of_before, FAMILY)
-    assert loaded.archive
-    assert loaded.archive.force_growth_n.tolist() == [0.0, 0.0, 0.0]
+    assert ResponseSurface.from_bytes(of_before, FAMILY).archive is None
 
 
 def test_the_best_of_an_archive_is_by_what_its_modes_did_and_keeps_the_task() -> None:
@@ -156,16 +154,24 @@ def test_the_best_of_an_archive_does_not_press() -> None:
 def test_modes_like_one_that_pressed_are_not_sought(surface: ResponseSurface) -> None:
     quickest = best_mode(surface, likes(speed_m_s=1.0), seed=0)
     modes = np.array([quickest, 0.9 * quickest, -quickest, FAMILY.reference])
-    measured = surface.predict(modes[:1])[0]
-    known = replace(surface, archive=ModeArchive(modes[:1], measured, np.zeros(1), np.array([9.0])))
-    foreseen = known.force_growth_n(modes)
-    assert 7.0 < foreseen[1] < foreseen[0] < 9.0
-    assert abs(foreseen[2]) < 0.2 * foreseen[0]
-    assert foreseen[3] == 0.0
-    careful = best_mode(known, likes(speed_m_s=1.0), seed=0, most_growth_n=5.0)
-    assert known.force_growth_n(careful) <= 5.0
-    assert 0.5 * measured[0, SPEED] < surface.predict(careful)[0][SPEED] < measured[0, SPEED]
-    np.testing.assert_array_equal(surface.force_growth_n(modes), np.zeros(4))
+    np.testing.assert_array_equal(surface.forces.growth_n_of(modes), np.zeros(4))
+    by_trial = surface.forces.with_observed(quickest, 9.0)
+    quickest_of_archive = ModeArchive(modes[:1], surface.predict(modes[:1])[0], np.zeros(1), np.array([9.0]))
+    by_archive = replace(surface, archive=quickest_of_archive).forces
+    for known in (by_trial, by_archive):
+        foreseen = known.growth_n_of(modes)
+        assert 7.0 < foreseen[1] < foreseen[0] < 9.0
+        assert abs(foreseen[2]) < 0.2 * foreseen[0]
+        assert foreseen[3] == 0.0
+        careful = best_mode(surface, likes(speed_m_s=1.0), seed=0, forces=known, most_growth_n=5.0)
+        assert known.growth_n_of(careful) <= 5.0
+        speeds = surface.predict(np.array([careful, quickest]))[0][:, SPEED]
+        assert 0.5 * speeds[1] < speeds[0] < speeds[1]
+
+
+def test_growth_of_forces_is_what_few_scenarios_exceed() -> None:
+    assert tail_growth_n(np.where(np.arange(200) < 6, 12.0, 1.0)) == pytest.approx(1.0)  # 3 of 100
+    assert tail_growth_n(np.where(np.arange(200) < 8, 12.0, 1.0)) == pytest.approx(12.0)  # 4 of 100
 
 
 def test_what_the_regression_gets_wrong_in_tried_modes_is_expected_of_modes_like_them(surface: ResponseSurface) -> None:

@@ -18,7 +18,8 @@ from scipy.special import expit, log_expit
 from worker.domain.scenarios import RESIDUAL, first_of
 from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
-from worker.ml.filters.fitting.response_surface import CAUTION, SUCCESS_TOLERANCE, ResponseSurface
+from worker.ml.filters.fitting.mode_worth import SUCCESS_TOLERANCE
+from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface
 from worker.ml.methods.kept_task import in_mode
 from worker.ml.methods.people import Person
 

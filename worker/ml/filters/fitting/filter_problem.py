@@ -17,7 +17,8 @@ from worker.domain.scenarios import GATE, RESIDUAL, first_of
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
-from worker.ml.filters.fitting.response_surface import CAUTION, PRESSED
+from worker.ml.filters.fitting.mode_archive import PRESSED
+from worker.ml.filters.fitting.response_surface import CAUTION
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.reward_models import RewardModel
 

@@ -43,7 +43,7 @@ def trial_of(
     gains = np.average(after - before, axis=1, weights=_weights(outcomes))
     unit = max(float(before.mean(axis=0).std()), 1e-9)
     success = float(outcomes.mean())
-    pressed = float((_largest_forces(filtered) - _largest_forces(reference) > problem.config.pressed_n).mean())
+    pressed = float((largest_forces(filtered) - largest_forces(reference) > problem.config.pressed_n).mean())
     return GateTrial(
         gate,
         residual_share,
@@ -138,13 +138,13 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
 
 def largest_force_n(trajectories: Sequence[Trajectory]) -> float:
     """On the person, in any of them."""
-    return float(_largest_forces(trajectories).max())
+    return float(largest_forces(trajectories).max())
 
 
 def _p95_force_n(trajectories: Sequence[Trajectory]) -> float:
-    return float(np.quantile(_largest_forces(trajectories), 0.95))
+    return float(np.quantile(largest_forces(trajectories), 0.95))
 
 
-def _largest_forces(trajectories: Sequence[Trajectory]) -> FloatArray:
+def largest_forces(trajectories: Sequence[Trajectory]) -> FloatArray:
     """(N,) in N, of every episode."""
     return np.array([each.contact_force_n.max() for each in trajectories])

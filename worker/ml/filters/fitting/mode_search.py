@@ -14,7 +14,8 @@ from worker.ml.filters.exported.shield import limits_of, untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.further_surface import FurtherSurface
-from worker.ml.filters.fitting.gate import acceptable, signal_changes, successes, try_on
+from worker.ml.filters.fitting.gate import acceptable, largest_forces, signal_changes, successes, try_on
+from worker.ml.filters.fitting.mode_archive import tail_growth_n
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards.beyond_sums.terms import RicherReward
@@ -82,6 +83,7 @@ class _ModeSearch:
     ) -> None:
         self.problem, self.reference, self.collect, self.progress = problem, reference, collect, progress
         self.archive, self.surface = surface.archive, replace(surface, archive=None)
+        self.forces = surface.forces
         self.wishes = problem.reward.signal_weights(pool.rollouts)
         self.further = _further(problem, self.wishes, pool)
         self.off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
@@ -148,6 +150,7 @@ class _ModeSearch:
             self.problem.seed,
             caution=_caution(self.problem),
             success_caution=self.problem.config.success_caution * (1 + rejected),
+            forces=self.forces,
             most_growth_n=self.problem.config.pressed_n / (1 + rejected),
             further=self.further.coefficients if self.further else None,
         )
@@ -161,6 +164,9 @@ class _ModeSearch:
         act = act_of(modes, self.problem.policy, weights)
         tried = _Tried(mode, *try_on(self.problem, act, gate, 0.0, self.reference, self.collect))
         self.tried.append(tried)
+        if gate == 1.0:
+            growth_n = tail_growth_n(largest_forces(tried.driven) - largest_forces(self.reference))
+            self.forces = self.forces.with_observed(mode, float(growth_n))
         if acceptable(self.problem, tried.trial, self.reference):
             self.accepted.append(tried)
         return tried

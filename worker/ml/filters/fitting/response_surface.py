@@ -5,7 +5,7 @@ same scenario. Given a person's weights on the signals, their best mode is then 
 """
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
 
@@ -17,15 +17,14 @@ from scipy.special import expit, logit
 from worker.domain.modes import ModeFamily
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
+from worker.ml.filters.fitting.mode_archive import ModeArchive, ModeForces, expected_of_alike
+from worker.ml.filters.fitting.mode_worth import SUCCESS_PENALTY, price_of_failures
 from worker.ml.rewards.reward_models import stored_config
 
 RIDGE = 1.0
 OUTLIER_SHARE = 0.005
 """Share at either end of every column that is cut to the quantile: a few crashes must not bend the surface."""
 
-SUCCESS_TOLERANCE = 0.015
-SUCCESS_PENALTY = 20.0
-"""Standard deviations of predicted return per unit of success lost beyond the tolerance."""
 DRAWS = 20_000
 CAUTION = 1.0
 """Standard deviations that are subtracted from a mode's predicted log odds of success, and where nothing is expected of
@@ -34,43 +33,7 @@ REFERENCE_PRECISION = 0.1
 """Of the prior of the reference policy's log odds of success: it is known from data alone."""
 NEWTON_STEPS = 15
 LONGEST_STEP = 3.0
-LENGTH = 0.5
-"""of the axes' ranges, over which what a regression gets wrong is alike"""
-NOISE = 0.1
-"""Variance of an archive's measured errors that is expected to be chance, in units of that which is not."""
-PRESSED = 0.035
-"""Share of scenarios in which the largest force grows by more than is said of a mode."""
 _ARCHIVE = "archive/"
-
-
-@dataclass(frozen=True)
-class ModeArchive:
-    """K modes that people drawn from a population would be given by a response surface.
-
-    The surface errs by some percent where it promises most, so that what is best for one of them by measurement often
-    serves others better than what the surface calls best for these (decision 187).
-    """
-
-    modes: FloatArray
-    """(K, A)"""
-    signals: FloatArray
-    """(K, S) mean change of the episode's summed signals"""
-    success: FloatArray
-    """(K,) change of the share of episodes in which the task is done"""
-    force_growth_n: FloatArray
-    """(K,) of an episode's largest force on the person, exceeded in PRESSED of the scenarios"""
-
-    def best(self, weights: FloatArray, most_growth_n: float = np.inf) -> FloatArray | None:
-        """(A,) the mode with the best return for these weights on the signals, (S,) or (E, S) for E members.
-
-        ``most_growth_n``: as in best_mode(). None: no mode is better than the reference policy.
-        """
-        returns = self.signals @ np.atleast_2d(weights).mean(axis=0)
-        unit = max(float(returns.std()), 1e-9)
-        lost = np.maximum(-self.success - SUCCESS_TOLERANCE, 0.0)
-        worth = np.where(self.force_growth_n <= most_growth_n, returns / unit - SUCCESS_PENALTY * lost, -np.inf)
-        best = int(np.argmax(worth))
-        return self.modes[best] if returns[best] > 0.0 and np.isfinite(worth[best]) else None
 
 
 @dataclass(frozen=True)
@@ -107,16 +70,17 @@ class ResponseSurface:
         signals, success = self._regressed(at, caution)
         if self.archive is None:
             return signals, success
-        return signals + self._likeness(at, self.archive) @ self._corrections(self.archive), success
+        tried = self.archive.modes
+        errors = self.archive.signals - self._regressed(tried)[0]
+        return signals + expected_of_alike(at, tried, errors, self.high - self.low), success
 
-    def force_growth_n(self, modes: FloatArray) -> FloatArray:
-        """(..., A) -> (...) what a mode's largest force is expected to grow by in PRESSED of the scenarios, in N.
-
-        It is what the archive's modes like it do; without an archive nothing is known, and 0.
-        """
+    @property
+    def forces(self) -> ModeForces:
+        """What is known of modes' forces before any was tried for a person: nothing without an archive."""
+        width = self.high - self.low
         if self.archive is None:
-            return np.zeros(modes.shape[:-1])
-        return self._likeness(modes, self.archive) @ self._weights(self.archive, self.archive.force_growth_n)
+            return ModeForces(np.zeros((0, len(width))), np.zeros(0), width)
+        return ModeForces(self.archive.modes, self.archive.force_growth_n, width)
 
     def _regressed(self, modes: FloatArray, caution: float = 0.0) -> tuple[FloatArray, FloatArray]:
         features = monomials(modes)
@@ -124,22 +88,6 @@ class ResponseSurface:
         deviation = np.sqrt(np.maximum(((features @ doubt) * features).sum(axis=-1), 0.0))
         change = features @ self.log_odds[1:] - caution * deviation
         return features @ self.coefficients, expit(self.log_odds[0] + change) - expit(self.log_odds[0])
-
-    def _corrections(self, archive: ModeArchive) -> FloatArray:
-        """(K, S) weights of the archive's modes for the errors in them."""
-        return self._weights(archive, archive.signals - self._regressed(archive.modes)[0])
-
-    def _weights(self, archive: ModeArchive, measured: FloatArray) -> FloatArray:
-        """(K, ...) of the archive's modes in a Gaussian process regression of what was measured in them."""
-        likeness = self._likeness(archive.modes, archive)
-        return np.asarray(np.linalg.solve(likeness + NOISE * np.eye(len(likeness)), measured), np.float64)
-
-    def _likeness(self, modes: FloatArray, archive: ModeArchive) -> FloatArray:
-        """(..., A) -> (..., K) covariances with the archive's modes, given that the mode 0 changes nothing."""
-        asked, tried = (each / (LENGTH * (self.high - self.low)) for each in (modes, archive.modes))
-        from_reference = [(each**2).sum(axis=-1) for each in (asked, tried)]
-        both = from_reference[0][..., None] + from_reference[1]
-        return np.asarray(np.exp(asked @ tried.T - both / 2) - np.exp(-both / 2), np.float64)
 
     def with_observed(self, mode: FloatArray, signal_deltas: FloatArray, successes: FloatArray) -> Self:
         """The surface after N more rollouts of one mode (A,): as if it had been fitted with them.
@@ -177,9 +125,8 @@ class ResponseSurface:
         tensors = {name: array.astype(np.float64) for name, array in load(stored).items()}
         archived = [name for name in tensors if name.startswith(_ARCHIVE)]
         of_archive = {name.removeprefix(_ARCHIVE): tensors.pop(name) for name in archived}
-        if of_archive:  # one from before decision 189 knows nothing of forces
-            of_archive.setdefault("force_growth_n", np.zeros_like(of_archive["success"]))
-        archive = ModeArchive(**of_archive) if of_archive else None
+        of_today = set(of_archive) == {each.name for each in fields(ModeArchive)}  # none, or without forces: not used
+        archive = ModeArchive(**of_archive) if of_today else None
         return cls(**tensors, axes=family.names, signals=signals, archive=archive)
 
     def save(self, path: Path) -> None:
@@ -254,10 +201,10 @@ def best_mode(
     weights: FloatArray,
     seed: int,
     *,
-    tolerance: float = SUCCESS_TOLERANCE,
     penalty: float = SUCCESS_PENALTY,
     caution: float = 0.0,
     success_caution: float = CAUTION,
+    forces: ModeForces | None = None,
     most_growth_n: float = np.inf,
     further: FloatArray | None = None,
 ) -> FloatArray:
@@ -266,9 +213,9 @@ def best_mode(
     The return counts as the members' mean less ``caution`` of their standard deviations. With a prior that expects
     something of people caution costs more than it saves, however few the labels (docs/results/few_answers.md). The
     chance of success is taken ``success_caution`` of its standard deviations lower. ``most_growth_n``: by which the
-    largest force on the person may grow, see ResponseSurface.force_growth_n(). ``further``: (M,) coefficients of what a
-    mode changes of the return beyond the signals. Random search with two local refinements; the mode 0 is always among
-    the candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
+    largest force on the person may grow, as far as ``forces`` foresee it. ``further``: (M,) coefficients of what a mode
+    changes of the return beyond the signals. Random search with two local refinements; the mode 0 is always among the
+    candidates and wins ties, so that somebody for whom nothing is better keeps the reference policy.
     """
     rng = np.random.default_rng(seed)
     width = surface.high - surface.low
@@ -282,8 +229,8 @@ def best_mode(
     def value() -> FloatArray:
         returns = (signals @ members.T + (monomials(candidates) @ beyond)[:, None]) / unit
         worth: FloatArray = returns.mean(axis=-1) - caution * returns.std(axis=-1)
-        kept = worth - penalty * np.maximum(-success - tolerance, 0.0)
-        return np.where(surface.force_growth_n(candidates) <= most_growth_n, kept, -np.inf)
+        kept = worth - price_of_failures(success, penalty)
+        return kept if forces is None else np.where(forces.growth_n_of(candidates) <= most_growth_n, kept, -np.inf)
 
     for spread in (0.2, 0.05):
         best = candidates[np.argsort(value())[-40:]]

@@ -4,7 +4,8 @@ import numpy as np
 
 from worker.domain.type_aliases import FloatArray
 from worker.ml import acquisition
-from worker.ml.filters.fitting.response_surface import SUCCESS_TOLERANCE, ResponseSurface
+from worker.ml.filters.fitting.mode_worth import SUCCESS_TOLERANCE
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.reward_models import StructuredReward
 
