@@ -205,29 +205,35 @@ def test_what_an_archive_says_of_modes_like_its_own_finds_one_that_is_better_tha
     assert found.trials[-1].preference > 1.2 * archived.preference > 0.0
 
 
+def pressing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    """What World.collect() drives, where whoever is slower than 0.017 presses."""
+    episodes = World().collect(act, scenarios, noise, seed)
+    slow = [each.signals[:, SPEED].mean() < 0.017 for each in episodes]
+    return [World(force_n=9.0 * presses).pressed(each) for presses, each in zip(slow, episodes, strict=True)]
+
+
 def test_whoever_wants_what_presses_gets_the_best_of_what_an_archive_says_does_not(
     reference: list[Trajectory], surface: ResponseSurface
 ) -> None:
-    """Whoever is much slower than the reference presses; of three modes the two slower ones are known to."""
-    plain = min(each.signals[:, SPEED].mean() for each in reference)
-
-    def pressing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        episodes = World().collect(act, scenarios, noise, seed)
-        slow = [each.signals[:, SPEED].mean() < 0.6 * plain for each in episodes]
-        return [World(force_n=9.0 * presses).pressed(each) for presses, each in zip(slow, episodes, strict=True)]
-
+    """Of three modes the two slower ones are known to press."""
     slowest = np.array([axis.low if axis.name.startswith("speed") else 0.0 for axis in FAMILY.axes])
     modes = np.outer([0.3, 0.7, 1.0], slowest)
-    blind = ModeArchive(modes, surface.predict(modes)[0], np.zeros(3), np.zeros(3))
-    knows = replace(blind, force_growth_n=np.array([0.0, 9.0, 9.0]))
+    archive = ModeArchive(modes, surface.predict(modes)[0], np.zeros(3), np.array([0.0, 9.0, 9.0]))
     unaware, aware = (
-        mode_search.find_mode(problem(-1.0, reference), replace(surface, archive=archive), Pool(), reference, pressing)
-        for archive in (blind, knows)
+        mode_search.find_mode(problem(-1.0, reference), each, Pool(), reference, pressing)
+        for each in (surface, replace(surface, archive=archive))
     )
     assert unaware.weights.gate < 1.0, "all that is tried must press for an archive to be needed"
     assert aware.weights.gate == 1.0
     assert aware.trials[-1].pressed == 0.0
     assert aware.trials[-1].preference > 0.0
+
+
+def test_trials_that_press_teach_what_does_not(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=5), surface, Pool(), reference, pressing)
+    assert found.trials[0].pressed == 1.0
+    assert found.weights.gate == 1.0
+    assert found.trials[-1].pressed == 0.0
 
 
 def test_a_filter_that_presses_too_hard_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:
