@@ -151,7 +151,7 @@ class _ModeSearch:
             caution=_caution(self.problem),
             success_caution=self.problem.config.success_caution * (1 + rejected),
             forces=self.forces,
-            most_growth_n=self.problem.config.pressed_n / (1 + rejected),
+            most_growth_n=self.problem.config.pressed_n,
             further=self.further.coefficients if self.further else None,
         )
 
