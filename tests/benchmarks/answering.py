@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from app.domain.study_settings import StudySettings
 from app.installed_tasks import catalogue, hints, qualities
+from tests.benchmarks import result_tables
 from tests.benchmarks.chosen_modes import stake
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
@@ -303,7 +304,9 @@ def parser(description: str | None, stem: str, seeds: int = 2) -> argparse.Argum
     if seeds:
         told.add_argument("--seeds", type=int, default=seeds)
     told.add_argument("--pools", type=Path, default=Path("data/answering"), help="where rollouts are kept")
-    told.add_argument("--output", type=Path, default=Path("docs/results") / stem, help="stem of both files")
+    told.add_argument(
+        "--output", type=result_tables.stem, default=Path("docs/results") / stem, help="stem of both files"
+    )
     return told
 
 

@@ -299,7 +299,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--scenarios", type=int, default=40, help="per user and change")
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 

@@ -26,6 +26,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.compute import simulation
 from worker.compute.pools import Compute, Lane
@@ -225,7 +226,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark/rollouts"))
     parser.add_argument("--journal", type=Path, default=Path("data/chosen_modes.jsonl"))
-    parser.add_argument("--output", type=Path, help="stem of the .md and the .csv")
+    parser.add_argument("--output", type=result_tables.stem, help="stem of the .md and the .csv")
     return parser.parse_args()
 
 

@@ -218,7 +218,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"))
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 

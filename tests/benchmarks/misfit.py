@@ -138,7 +138,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--tasks", nargs="+", choices=[*ON_TIME_S], default=[*ON_TIME_S])
     parser.add_argument("--people", type=int, default=8, help="of each kind and task")
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of the pools")
-    parser.add_argument("--output", type=Path, default=Path("docs/results/misfit"), help="stem of both files")
+    parser.add_argument(
+        "--output", type=result_tables.stem, default=Path("docs/results/misfit"), help="stem of both files"
+    )
     return parser.parse_args()
 
 

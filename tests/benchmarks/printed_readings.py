@@ -20,6 +20,7 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.comparison.comparison_rows import Row
 from worker.analysis.comparison.table_files import to_csv
@@ -166,7 +167,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--scenarios", type=int, default=200)
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"))
-    parser.add_argument("--output", type=Path, help="stem of the .md and the .csv")
+    parser.add_argument("--output", type=result_tables.stem, help="stem of the .md and the .csv")
     return parser.parse_args()
 
 

@@ -9,7 +9,6 @@ until the promise is earned. How often a scenario is harmed is known here. Nothi
 import argparse
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -111,7 +110,9 @@ def _table(rows: Sequence[dict[str, Any]], people: int) -> str:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--people", type=int, default=1000)
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 

@@ -275,7 +275,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts and finished filters"
     )
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 

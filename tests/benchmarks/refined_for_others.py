@@ -229,7 +229,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--linear", type=int, default=100, help="linear people whose evidence is counted")
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
     parser.add_argument(
-        "--output", type=Path, default=Path("docs/results/refined_for_others"), help="stem of both files"
+        "--output", type=result_tables.stem, default=Path("docs/results/refined_for_others"), help="stem of both files"
     )
     return parser.parse_args()
 

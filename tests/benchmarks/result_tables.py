@@ -11,6 +11,12 @@ LONGEST_FIELD = 1_000_000
 """The gains of some hundred scenarios are in one."""
 
 
+def stem(text: str) -> Path:
+    """An option's value, a path without ending: its folder is made before anything is measured, not after hours."""
+    Path(text).parent.mkdir(parents=True, exist_ok=True)
+    return Path(text)
+
+
 def read(table: Path) -> list[dict[str, str]]:
     """The rows of a table; none when there is no file."""
     if not table.exists():

@@ -158,7 +158,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--work-directory", type=Path, default=Path("data/benchmark"), help="of the benchmark's rollouts"
     )
-    parser.add_argument("--output", type=Path, help="path without ending of the page and the table")
+    parser.add_argument("--output", type=result_tables.stem, help="path without ending of the page and the table")
     return parser.parse_args()
 
 

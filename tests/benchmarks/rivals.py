@@ -166,7 +166,9 @@ def _options() -> argparse.Namespace:
     )
     parser.add_argument("--on-workers", type=int, metavar="N", help="how many cells each worker does at a time")
     parser.add_argument("--report-only", action="store_true", help="run nothing, write the page from the table")
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 

@@ -8,11 +8,11 @@ distribution, so the true difference is 0 and the true probability of improvemen
 """
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from tests.benchmarks import result_tables
 from worker.analysis.comparison import aggregate, result_pages
 from worker.analysis.comparison.table_files import to_csv
 from worker.domain.type_aliases import FloatArray
@@ -29,7 +29,9 @@ def main() -> None:
     """Write the table and the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tables", type=int, default=200)
-    parser.add_argument("--output", type=Path, required=True, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     options = parser.parse_args()
     rows = []
     for seeds in (1, 3, 5):

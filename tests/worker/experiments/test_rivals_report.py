@@ -67,3 +67,9 @@ def test_a_table_whose_writing_fails_stays_as_it_was(tmp_path: Any) -> None:
     with pytest.raises(ValueError, match="gain"):
         result_tables.write(table, [{"user": "neutral"}, {"user": "cautious", "gain": 2.5}])
     assert result_tables.read(table) == [{"user": "neutral", "gain": "1.5"}]
+
+
+def test_the_folder_of_a_table_is_there_before_its_rows(tmp_path: Any) -> None:
+    table = result_tables.stem(f"{tmp_path}/new/folder/rows").with_suffix(".csv")
+    result_tables.write(table, [{"user": "neutral"}])
+    assert result_tables.read(table) == [{"user": "neutral"}]
