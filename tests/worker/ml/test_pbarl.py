@@ -229,6 +229,17 @@ def test_whoever_wants_what_presses_gets_the_best_of_what_an_archive_says_does_n
     assert aware.trials[-1].preference > 0.0
 
 
+def test_what_an_archive_says_presses_is_never_tried(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    """Nothing presses in this world, so that only the archive can have kept the search from what is wanted most."""
+    asked = problem(-1.0, reference, mode_attempts=1)
+    unaware = mode_search.find_mode(asked, surface, Pool(), reference, World().collect)
+    wanted = np.array([[unaware.weights.mode[name] for name in FAMILY.names]])
+    archive = ModeArchive(wanted, surface.predict(wanted)[0], np.zeros(1), np.array([9.0]))
+    aware = mode_search.find_mode(asked, replace(surface, archive=archive), Pool(), reference, World().collect)
+    assert aware.trials[-1].preference > 0.0
+    assert unaware.trials[0].preference not in [each.preference for each in aware.trials]
+
+
 def test_trials_that_press_teach_what_does_not(reference: list[Trajectory], surface: ResponseSurface) -> None:
     found = mode_search.find_mode(problem(-1.0, reference, mode_attempts=5), surface, Pool(), reference, pressing)
     assert found.trials[0].pressed == 1.0

@@ -37,9 +37,10 @@ def find_mode(
 
     The best predicted mode lies where the surface knows least, and is the one whose success and return are most likely
     overestimated. It is therefore tried on the held-out scenarios of ``reference``, the surface learns from the trial,
-    and the search goes on from there, more careful about success with every trial that was not acceptable. When no
-    attempt is acceptable the last mode is weakened; at worst it is off. Where the surface has an archive, the best of
-    that is tried, too, and the best by what it corrects of the surface (decisions 187 and 188).
+    and the search goes on from there, more careful about success with every trial that was not acceptable. What is
+    foreseen to press harder than the study allows, by an archive and by the trials before, is not tried (decision 190).
+    When no attempt is acceptable the last mode is weakened; at worst it is off. Where the surface has an archive, the
+    best of that is tried, too, and the best by what it corrects of the surface (decisions 187 and 188).
     ``pool``: rollouts of many modes, used only when the reward is not linear in the signals. Of a reward with further
     terms they say what modes do to these, and more modes are tried, all of them to choose from (decision 185).
     """
