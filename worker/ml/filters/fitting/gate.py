@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
+import numpy.typing as npt
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, FloatArray
@@ -43,7 +44,7 @@ def trial_of(
     gains = np.average(after - before, axis=1, weights=_weights(outcomes))
     unit = max(float(before.mean(axis=0).std()), 1e-9)
     success = float(outcomes.mean())
-    pressed = float((largest_forces(filtered) - largest_forces(reference) > problem.config.pressed_n).mean())
+    pressed = float(_pressed(problem, reference, filtered).mean())
     return GateTrial(
         gate,
         residual_share,
@@ -102,7 +103,7 @@ def keeps_task(
     config = problem.config
     succeeds = trial.success_change >= -of_tolerance * config.success_tolerance
     presses = trial.pressed > of_tolerance * config.pressed_tolerance
-    return succeeds and not presses and keeps_forces(problem, trial, reference)
+    return succeeds and not presses and _is_gentle(problem, trial.p95_force_n, reference)
 
 
 def loses_nothing(trial: GateTrial) -> bool:
@@ -111,22 +112,24 @@ def loses_nothing(trial: GateTrial) -> bool:
 
 
 def keeps_task_in_all(
-    problem: FilterProblem, trials: Sequence[GateTrial], references: Sequence[Sequence[Trajectory]]
-) -> bool:
-    """Whether no more is lost than the tolerance of all scenarios together, and forces stay within theirs everywhere.
+    problem: FilterProblem, reference: Sequence[Trajectory], filtered: Sequence[Trajectory], within: float = 0.0
+) -> bool | None:
+    """Whether no more is lost than the tolerance of all these scenarios together, and forces stay within theirs.
 
-    ``trials``: one for each of ``references``, all of the same filter.
+    None: not clear yet, as fewer than ``within`` scenarios would change that, or forces alone are against it.
     """
-    config, sizes = problem.config, [len(each) for each in references]
-    success = np.average([each.success_change for each in trials], weights=sizes)
-    pressed = np.average([each.pressed for each in trials], weights=sizes)
-    gentle = all(keeps_forces(problem, *each) for each in zip(trials, references, strict=True))
-    return gentle and success >= -config.tolerance_in_all and pressed <= config.tolerance_in_all
+    failed = float((successes(reference) - successes(filtered)).sum())
+    lost = max(failed, float(_pressed(problem, reference, filtered).sum()))
+    spare = problem.config.tolerance_in_all * len(reference) - lost
+    gentle = _is_gentle(problem, _p95_force_n(filtered), reference)
+    if abs(spare) < within or (within and spare > 0.0 and not gentle):
+        return None
+    return spare >= 0.0 and gentle
 
 
-def keeps_forces(problem: FilterProblem, trial: GateTrial, reference: Sequence[Trajectory]) -> bool:
+def _is_gentle(problem: FilterProblem, p95_force_n: float, reference: Sequence[Trajectory]) -> bool:
     """Whether almost all episodes stay below the largest accepted force, or below the reference policy's."""
-    return trial.p95_force_n <= max(problem.config.force_limit_n, _p95_force_n(reference))
+    return p95_force_n <= max(problem.config.force_limit_n, _p95_force_n(reference))
 
 
 def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Trajectory]) -> float:
@@ -134,6 +137,14 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
     alone = (each for each in reversed(draft.trials) if not each.refined and each.residual_share == 0.0)
     trial = next(alone, None)
     return trial.preference if trial and acceptable(problem, trial, reference) else 0.0
+
+
+def _pressed(
+    problem: FilterProblem, reference: Sequence[Trajectory], filtered: Sequence[Trajectory]
+) -> npt.NDArray[np.bool_]:
+    """(N,) whether somebody is pressed much harder."""
+    growth: FloatArray = largest_forces(filtered) - largest_forces(reference)
+    return growth > problem.config.pressed_n
 
 
 def largest_force_n(trajectories: Sequence[Trajectory]) -> float:

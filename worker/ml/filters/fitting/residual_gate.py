@@ -17,11 +17,15 @@ from worker.ml.filters.fitting.gate import (
     largest_force_n,
     loses_nothing,
     to_beat,
-    try_on,
+    trial_of,
 )
 
 LESS = 2 / 3
 """of a share that loses too much in other scenarios is what is tried there next, or less"""
+LOOK = 40
+"""of the other scenarios, after which it is asked whether it is clear yet that a share keeps the task"""
+CLEAR = 2.0
+"""scenarios more or less lost than are accepted of as many: then it mostly stays so to the end (decision 191)"""
 
 
 def gate_residual(
@@ -110,20 +114,28 @@ class _ResidualGate:
         """Whether it loses nothing in the gate's scenarios, or little enough in these and others together."""
         if loses_nothing(tried.trial):
             return True
-        references = [self.reference, self.more_reference()]
-        again, _ = self._drive(tried.share, references[1])
-        return keeps_task_in_all(self.problem, [tried.trial, again], references)
+        others, driven, keeps = self.more_reference(), list[Trajectory](), None
+        while keeps is None:
+            driven += self._driven(tried.share, others[len(driven) : len(driven) + LOOK])
+            beside = others[: len(driven)]
+            within = CLEAR if len(driven) < len(others) else 0.0
+            keeps = keeps_task_in_all(self.problem, [*self.reference, *beside], [*tried.driven, *driven], within)
+        self._noted(tried.share, beside, driven)
+        return keeps
 
     def _try(self, share: float) -> _Tried:
-        return _Tried(share, *self._drive(share, self.reference))
+        driven = self._driven(share, self.reference)
+        return _Tried(share, self._noted(share, self.reference, driven), driven)
 
-    def _drive(self, share: float, beside: Sequence[Trajectory]) -> tuple[GateTrial, Sequence[Trajectory]]:
+    def _driven(self, share: float, beside: Sequence[Trajectory]) -> Sequence[Trajectory]:
         self.progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.01 * len(self.trials))
         weights = self.draft.weights.changed(residual_share=share)
         act = act_of(self.problem.task.modes, self.problem.policy, weights)
-        trial, driven = try_on(self.problem, act, weights.gate, share, beside, self.collect)
-        self.trials.append(trial)
-        return trial, driven
+        return self.collect(act, [each.scenario for each in beside], 0.0, self.problem.seed)
+
+    def _noted(self, share: float, beside: Sequence[Trajectory], driven: Sequence[Trajectory]) -> GateTrial:
+        self.trials.append(trial_of(self.problem, self.draft.weights.gate, share, beside, driven))
+        return self.trials[-1]
 
 
 def _ever_less(climbed: Sequence[_Tried]) -> Iterator[_Tried]:
