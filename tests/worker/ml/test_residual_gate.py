@@ -13,6 +13,8 @@ from worker.domain.type_aliases import Act
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import FilterProblem
+from worker.ml.filters.fitting.gate import keeps_task_in_all
 from worker.ml.filters.fitting.residual import learn_round
 from worker.ml.filters.fitting.residual_gate import gate_residual
 
@@ -101,6 +103,16 @@ def others_of(scenarios: Sequence[int]) -> list[Trajectory]:
     return World().collect(POLICY.mean, scenarios[6:], 0.0, 0)
 
 
+def kept_and_looks(
+    asked: FilterProblem, draft: FilterDraft, reference: list[Trajectory], fails_in: Sequence[int], others: int
+) -> tuple[float, int]:
+    """What is kept if it fails in these of six scenarios and so many others, and how often 40 of them are driven."""
+    scenarios = first_of(GATE, 6 + others)
+    world = Timed([scenarios[place] for place in fails_in])
+    gated = gate_residual(asked, draft, reference, lambda: others_of(scenarios), world.collect)
+    return gated.weights.residual_share, world.asked.count(40)
+
+
 @pytest.mark.parametrize(
     ("fails_in", "kept", "tried_in_others"),
     [
@@ -116,11 +128,7 @@ def test_what_loses_anything_is_tried_in_other_scenarios_and_may_lose_little_in_
 ) -> None:
     """From its whole on a residual fails in some of six scenarios and of forty others; a tenth of all are accepted."""
     asked = problem(-1.0, reference, success_tolerance=0.1, tolerance_in_all=0.1)
-    scenarios = first_of(GATE, 46)
-    world = Timed([scenarios[place] for place in fails_in])
-    gated = gate_residual(asked, of_somebody_slow, reference, lambda: others_of(scenarios), world.collect)
-    assert gated.weights.residual_share == kept
-    assert world.asked.count(40) == tried_in_others
+    assert kept_and_looks(asked, of_somebody_slow, reference, fails_in, others=40) == (kept, tried_in_others)
 
 
 @pytest.mark.parametrize(
@@ -137,11 +145,29 @@ def test_no_more_other_scenarios_are_driven_than_make_it_clear_whether_a_residua
 ) -> None:
     """A twentieth of all may be lost: 2.3, 4.3 and 6.3 after each look. What is refused is tried at twice and whole."""
     asked = problem(-1.0, reference, success_tolerance=0.1, tolerance_in_all=0.05)
-    scenarios = first_of(GATE, 126)
-    world = Timed([scenarios[place] for place in fails_in])
-    gated = gate_residual(asked, of_somebody_slow, reference, lambda: others_of(scenarios), world.collect)
-    assert gated.weights.residual_share == kept
-    assert world.asked.count(40) == looks
+    assert kept_and_looks(asked, of_somebody_slow, reference, fails_in, others=120) == (kept, looks)
+
+
+@pytest.mark.parametrize(
+    ("failed", "pressing", "clear", "in_the_end"),
+    [(0, 0, True, True), (0, 3, None, False), (4, 0, None, True), (5, 0, None, False), (7, 3, False, False)],
+)
+def test_forces_alone_refuse_a_residual_only_when_all_others_are_driven(
+    failed: int, pressing: int, clear: bool | None, in_the_end: bool, reference: list[Trajectory]
+) -> None:
+    """A tenth of forty scenarios may be lost, and 3 of 40 with 12 N are more than one in twenty above 10 N."""
+    asked = problem(-1.0, reference, pressed_n=20.0, tolerance_in_all=0.1)
+    before = World().collect(POLICY.mean, first_of(GATE, 40), 0.0, 0)
+    after = [
+        replace(
+            each,
+            success=place >= failed,
+            contact_force_n=np.full_like(each.contact_force_n, 12.0 if place < pressing else 0.0),
+        )
+        for place, each in enumerate(before)
+    ]
+    assert keeps_task_in_all(asked, before, after, within=2.0) is clear
+    assert keeps_task_in_all(asked, before, after) is in_the_end
 
 
 def test_of_what_loses_too_much_in_other_scenarios_two_thirds_or_less_are_next(
