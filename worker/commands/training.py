@@ -7,14 +7,20 @@ from pathlib import Path
 
 from app.settings import Settings
 from worker.commands.arguments import Commands, add_processes, add_task
-from worker.experiments import archive_modes, fit_response_surface, pretrain_policy, train_signal_predictor
+from worker.experiments import (
+    archive_modes,
+    archive_policies,
+    fit_response_surface,
+    pretrain_policy,
+    train_signal_predictor,
+)
 from worker.ml.policies.onnx_policy import NotAPolicy
 from worker.sim.lab.errors import LabTaskBroken
 from worker.tasks.registry import NotExplored, checkpoint
 
 
 def add(commands: Commands) -> None:
-    """Add ``pretrain``, ``explore``, ``archive`` and ``foresee``."""
+    """Add ``pretrain``, ``explore``, ``archive``, ``archive-policies`` and ``foresee``."""
     pretrain = commands.add_parser("pretrain", help=pretrain_policy.pretrain.__doc__)
     add_task(pretrain)
     pretrain.add_argument("--seed", type=int, default=0)
@@ -34,6 +40,13 @@ def add(commands: Commands) -> None:
     archive.add_argument("--work-directory", type=Path, help="finished blocks; default: archive/ in the data directory")
     add_processes(archive)
     archive.set_defaults(act=_archive)
+
+    policies = commands.add_parser("archive-policies", help=archive_policies.archive_policies.__doc__)
+    add_task(policies)
+    policies.add_argument(
+        "--work-directory", type=Path, help="finished policies; default: archive-policies/ in the data directory"
+    )
+    policies.set_defaults(act=_archive_policies)
 
     foresee = commands.add_parser("foresee", help=train_signal_predictor.foresee.__doc__)
     add_task(foresee)
@@ -68,6 +81,12 @@ def _archive(said: argparse.Namespace) -> int:
         sys.stderr.write(f"Error: {error}\n")
         return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")
+    return 0
+
+
+def _archive_policies(said: argparse.Namespace) -> int:
+    work = said.work_directory or Settings().data_dir / "archive-policies" / said.task
+    sys.stdout.write(json.dumps(archive_policies.archive_policies(said.task, work), indent=2) + "\n")
     return 0
 
 

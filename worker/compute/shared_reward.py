@@ -23,7 +23,7 @@ def of_people(task: str, rewards: Sequence[bytes], scale: SignalScale) -> bytes:
     """
     reference = reference_rollouts(task)
     models = [load_reward_model(each) for each in rewards]
-    return _stored(task, np.array([each.signal_weights(reference).mean(axis=0) for each in models]), scale)
+    return reward_of(task, np.array([each.signal_weights(reference).mean(axis=0) for each in models]), scale)
 
 
 def of_types(task: str, users: Sequence[str], scale: SignalScale) -> bytes:
@@ -31,8 +31,8 @@ def of_types(task: str, users: Sequence[str], scale: SignalScale) -> bytes:
     known = registry.task(task)
     if known.is_a_labs:
         minds = {taste.name: taste.signal_weights(known.signals) for taste in OF_LABS}
-        return _stored(task, np.array([minds[user] for user in users]), scale)
-    return _stored(task, np.array([signal_weights(known, OMEGA[User(user)]) for user in users]), scale)
+        return reward_of(task, np.array([minds[user] for user in users]), scale)
+    return reward_of(task, np.array([signal_weights(known, OMEGA[User(user)]) for user in users]), scale)
 
 
 def types_of(task: str) -> list[str]:
@@ -40,8 +40,11 @@ def types_of(task: str) -> list[str]:
     return [taste.name for taste in OF_LABS] if registry.task(task).is_a_labs else [user.value for user in OMEGA]
 
 
-def _stored(task: str, weights: FloatArray, scale: SignalScale) -> bytes:
-    """(P, S), reward per unit of each signal -> a model whose one member is the mean of P, each scaled alike."""
+def reward_of(task: str, weights: FloatArray, scale: SignalScale) -> bytes:
+    """A stored model whose one member is the mean of P people's weights, each scaled alike.
+
+    ``weights``: (P, S) reward per unit of each signal; ``scale``: of the pool that they have seen.
+    """
     reference = reference_rollouts(task)
     alike = [StructuredReward(each[None]).normalised_over(reference).signal_weights()[0] for each in weights]
     mean = StructuredReward(

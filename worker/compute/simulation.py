@@ -101,6 +101,17 @@ def predictor_file(name: str) -> Path:
     return checkpoint(name) / "signal_predictor.safetensors"
 
 
+def archive_folder(name: str) -> Path:
+    """Where the policies are kept that were refined for a task beforehand, and their record."""
+    return checkpoint(name) / "refined"
+
+
+@cache
+def archived_policies(name: str) -> Mapping[str, GaussianPolicy]:
+    """By their names; none: the task has no archive of them."""
+    return {file.stem: GaussianPolicy.load(file) for file in sorted(archive_folder(name).glob("*.safetensors"))}
+
+
 @cache
 def signal_predictor(name: str) -> SignalPredictor:
     """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
