@@ -127,6 +127,7 @@ class Bench:
             reference=self.cache.reference,
             collect=lambda *drive: learning.run_scenarios(task.name, *drive),
             make_env=registry.environment_class(task.name),
+            archived=self.cache.archived,
             person=asked,
         )
 

@@ -28,7 +28,8 @@ from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.reinforcement.refinement import Refinement, given_up, is_promising
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.refinement import Refinement, is_promising
 from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.loading import load_reward_model
 from worker.tasks import registry
@@ -114,15 +115,15 @@ class FilterFit:
         a folder for checkpoints, in a compute process, until that gives drafts.
         """
         is_ahead = begun is not None and refining.is_ahead(begun, Refinement(steps))
-        training = self._training(draft, known, steps, watched=not is_ahead)
-        if begun and is_ahead and not self._is_promising(training, begun):
-            return given_up(draft)
-        drafts = train(partial(refining.train, training, begun))
-        if not drafts:
-            return None
-        return gate_refined(
-            self.problem, drafts, training.reference, self._check_reference, self.collect, self.progress
-        )
+        start = self._best_beginning(draft)
+        training = self._training(draft if is_ahead else start, known, steps, watched=not is_ahead)
+        drafts: tuple[FilterDraft, ...] = ()
+        if not (begun and is_ahead) or self._is_promising(training, begun):
+            drafts = train(partial(refining.train, training, begun)) or ()
+            if not drafts:
+                return None
+        reference = training.reference
+        return gate_refined(self.problem, start, drafts, reference, self._check_reference, self.collect, self.progress)
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
         self.progress("checking what the refinement has come to", 0.34)
@@ -132,7 +133,7 @@ class FilterFit:
     def refine_ahead(self, pool: Pool, steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""
         self._check_reference()  # while nobody waits for it
-        training = self._training(self.find_mode(pool), pool.rollouts, steps, watched=True)
+        training = self._training(self._best_beginning(self.find_mode(pool)), pool.rollouts, steps, watched=True)
         train(partial(refining.train_ahead, training))
 
     def _training(
@@ -142,6 +143,14 @@ class FilterFit:
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
         return refining.Training(self.task, self.problem, draft, known, reference, looks, config)
+
+    def _best_beginning(self, draft: FilterDraft) -> FilterDraft:
+        """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
+        scenarios, archived = self.problem.config.gate_block(self.problem.task), []
+        for name, policy in simulation.archived_policies(self.task).items():
+            driven = self._driven(f"{self.task} refined beforehand: {name}", policy, scenarios)
+            archived.append(ArchivedPolicy(policy, driven))
+        return best_beginning(self.problem, draft, archived, self._gate_reference())
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""
@@ -217,8 +226,9 @@ class FilterFit:
     def reference(self, scenarios: range, policy: str = "") -> Sequence[Trajectory]:
         """The frozen policy's rollouts, or those of another one: the same for everybody, so they are made once per
         worker."""
-        key = (f"{self.task} {policy}".strip(), scenarios)
-        if key not in self.references:
-            act = simulation.reference_policy(self.task, policy).mean
-            self.references[key] = self.collect(act, scenarios, 0.0, 0)
-        return self.references[key]
+        return self._driven(f"{self.task} {policy}".strip(), simulation.reference_policy(self.task, policy), scenarios)
+
+    def _driven(self, name: str, policy: ReferencePolicy, scenarios: range) -> Sequence[Trajectory]:
+        if (name, scenarios) not in self.references:
+            self.references[name, scenarios] = self.collect(policy.mean, scenarios, 0.0, 0)
+        return self.references[name, scenarios]

@@ -141,7 +141,9 @@ class _Making:
         folder.mkdir(exist_ok=True)
         beginning = Beginning(registry.environment_class(self.name), self.pool.rollouts, gate, watched, self._collect)
         drafts = refine(problem, start, beginning, self.config, Checkpoint(folder))
-        draft = gate_refined(problem, drafts, gate, lambda: reference(config.check_block(self.task)), self._collect)
+        draft = gate_refined(
+            problem, draft, drafts, gate, lambda: reference(config.check_block(self.task)), self._collect
+        )
         shutil.rmtree(folder)
         return draft
 

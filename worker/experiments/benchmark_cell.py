@@ -198,6 +198,7 @@ class BenchmarkUser:
             collect=self._collect,
             make_env=registry.environment_class(self.cell.task),
             config=self.terms.methods,
+            archived=self.rollout_cache.archived,
             person=self._person(),
         )
 

@@ -9,6 +9,9 @@ from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.fitting.pool import Pool
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.policies.reference import ReferencePolicy
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy
 from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.whole_files import written_whole
@@ -38,11 +41,21 @@ class RolloutCache:
         drawn = [simulation.behaviours(self.task, each, BEHAVIOURS_PER_SCENARIO) for each in scenarios]
         return Pool(self.behaviours(scenarios), [each.described() for some in drawn for each in some])
 
+    def archived(self, scenarios: Sequence[int]) -> list[ArchivedPolicy]:
+        """The task's policies that were refined beforehand, in these scenarios."""
+        return [self._archived(policy, scenarios) for policy in simulation.archived_policies(self.task).values()]
+
+    def _archived(self, policy: GaussianPolicy, scenarios: Sequence[int]) -> ArchivedPolicy:
+        name = f"refined-{_weights_mark(policy)}"
+        return ArchivedPolicy(policy, [self._driven(policy, name, each) for each in scenarios])
+
     def _reference(self, scenario: int) -> Trajectory:
-        path = self.directory / f"reference-{scenario}.npz"
+        return self._driven(simulation.reference_policy(self.task), "reference", scenario)
+
+    def _driven(self, policy: ReferencePolicy, name: str, scenario: int) -> Trajectory:
+        path = self.directory / f"{name}-{scenario}.npz"
         if path.exists():
             return _load(path)
-        policy = simulation.reference_policy(self.task)
         return _kept(rollout(simulation.environment(self.task), policy.mean, scenario), path)
 
     def _behaviours(self, scenario: int) -> list[Trajectory]:
@@ -59,8 +72,13 @@ class RolloutCache:
 
 def policy_mark(task: str) -> str:
     """Eight characters that change with the task's frozen policy and with anything its description says."""
-    mark = hashlib.sha256(repr(registry.task(task)).encode())
-    for name, array in sorted(simulation.reference_policy(task).weights.items()):
+    description = repr(registry.task(task)).encode()
+    return _weights_mark(simulation.reference_policy(task), description)
+
+
+def _weights_mark(policy: ReferencePolicy, before: bytes = b"") -> str:
+    mark = hashlib.sha256(before)
+    for name, array in sorted(policy.weights.items()):
         mark.update(name.encode() + array.tobytes())
     return mark.hexdigest()[:8]
 

@@ -74,7 +74,7 @@ def gate_refined(
     """Checked in scenarios that the gate does not have, where the frozen policy is as good as in these."""
     driven = collect(POLICY.mean, CHECKED, 0.0, 0)
     checked = [replace(each, success=reference[0].success) for each in driven]
-    return refinement_gate.gate_refined(problem, drafts, reference, lambda: checked, drive)
+    return refinement_gate.gate_refined(problem, FilterDraft(GATED), drafts, reference, lambda: checked, drive)
 
 
 def weights_of(drafts: Sequence[FilterDraft]) -> list[bytes]:
@@ -294,7 +294,7 @@ def test_where_the_whole_last_policy_loses_the_task_whatever_gains_most_is_next(
 
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
-    gated = refinement_gate.gate_refined(strict, watched, succeeding, lambda: succeeding, later)
+    gated = refinement_gate.gate_refined(strict, FilterDraft(GATED), watched, succeeding, lambda: succeeding, later)
     *tried, checked = gated.trials
     assert [trial.success_change < -0.5 for trial in tried] == [True] * lost + [False] * (6 - lost if lost else 1)
     chances = [each.weights.changed(gate=gate) for each in watched for gate in refinement_gate.STRENGTHS]
@@ -341,7 +341,7 @@ def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: li
     assert not refinement.is_promising(likes, draft, reference, config, checkpoint, collect)
     ambitious = replace(draft, trials=(GateTrial(0.6, 0.0, 99.0, 0.0, 0.0),))
     assert not refinement.is_promising(problem(), ambitious, reference, config, checkpoint, collect)
-    assert "given up" in refinement.given_up(draft).notes[-1]
+    assert "given up" in gate_refined(problem(), [], reference, collect).notes[-1]
 
 
 def test_a_training_that_changed_its_mind_and_paused_ends_with_the_same_policy(

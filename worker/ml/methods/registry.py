@@ -50,6 +50,7 @@ from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
 from worker.ml.reinforcement import refinement
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
 from worker.ml.reinforcement.guided_reward import sketchy
 from worker.ml.reinforcement.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.reinforcement.refinement import Refinement
@@ -102,6 +103,8 @@ class Setting:
     config: MethodConfig = MethodConfig()
     checkpoint: Checkpoint | None = None
     """where a training that takes minutes keeps what a restart needs, and says how far it is"""
+    archived: Callable[[range], Sequence[ArchivedPolicy]] = lambda _: ()
+    """the task's policies that were refined beforehand, in these scenarios"""
     person: Person | None = None
     """who can be asked for more than labels; None: nobody"""
 
@@ -164,18 +167,20 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     more_reference = partial(setting.reference, problem.config.check_block(problem.task))
     watched = setting.reference(problem.config.watch_block(problem.task))
     beginning = refinement.Beginning(setting.make_env, setting.pool.rollouts, reference, watched, setting.collect)
+    archived = setting.archived(problem.config.gate_block(problem.task))
     first = setting.asked().labels.first(answers_ahead(setting.labels))
     early = replace(problem, reward=setting.asked().fit(first))
     mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
-        refinement.refine_ahead(early, mode, beginning, config, checkpoint)
+        refinement.refine_ahead(early, best_beginning(early, mode, archived, reference), beginning, config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
-            if not refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
-                return refinement.given_up(draft)
-            drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
-            return gate_refined(problem, drafts, reference, more_reference, setting.collect)
+            drafts: tuple[FilterDraft, ...] = ()
+            if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
+                drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
+            start = best_beginning(problem, draft, archived, reference)
+            return gate_refined(problem, start, drafts, reference, more_reference, setting.collect)
 
         return _shipped(setting, _fitted(setting, refined))
 

@@ -1,9 +1,9 @@
-"""The longest stage of the studio's filter: a policy of the person's own, which begins as the mode.
+"""The longest stage of the studio's filter: a policy of the person's own, which begins as the mode or an archived one.
 
-A network imitates the mode; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()). Its
-replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to what it was
-some time before, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets the
-task before it finds anything better. Where it forgets it all the same it goes back (docs/method.md, section 5).
+A network imitates what it begins as; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()).
+Its replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to what it
+was some time before, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets
+the task before it finds anything better. Where it forgets it all the same it goes back (docs/method.md, section 5).
 """
 
 import hashlib
@@ -142,11 +142,6 @@ def is_promising(
     actor.load_state_dict(best_in(kept[0]))
     trial, _ = try_refined(problem, _with(draft, actor), 1.0, reference[:LOOKED_AT], collect)
     return trial.preference > to_beat(problem, draft, reference)
-
-
-def given_up(draft: FilterDraft) -> FilterDraft:
-    """Without a refinement, which is not promising."""
-    return replace(draft, notes=(*draft.notes, "The refinement had made nothing better on the way and was given up."))
 
 
 def _train(

@@ -14,8 +14,13 @@ from worker.ml.filters.fitting.gate import keeps_task, to_beat, try_on
 
 _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
-    "is shown, and may have gone elsewhere since."
+    "is shown, or as what was refined beforehand for people who mind one thing, and may have gone elsewhere since."
 )
+_AS_IT_BEGAN = (
+    "The filter is a policy that was refined beforehand for people who mind one thing: reinforcement learning on the "
+    "learned preference found none better for this person."
+)
+_GIVEN_UP = "The refinement had made nothing better on the way and was given up."
 _DOUBTED = "The answers do not say clearly enough that the refined policy is better, and it is off."
 STRENGTHS = (1.0, 0.8, 0.6)
 """Blended with the reference policy."""
@@ -52,20 +57,27 @@ def try_refined(
 
 def gate_refined(
     problem: FilterProblem,
+    start: FilterDraft,
     drafts: Sequence[FilterDraft],
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
 ) -> FilterDraft:
-    """As much of the refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
+    """As much of a refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
 
-    ``drafts``: of refine(). The whole last policy is tried first, and is mostly it. Where it is not good enough, less
-    of it and what had been best on the way are tried, and what gains most of these comes first. ``more_reference``:
-    the frozen policy in the scenarios of the check, which what passes the gate is tried in, too.
+    ``start``: with the archived policy that was the best beginning, which is one of those to choose from, or with the
+    mode alone; ``drafts``: of refine(), none where that was given up. The whole last policy, which is mostly it, and
+    the archived one are tried first. Where neither is good enough, less of them and what had been best on the way are
+    tried. What gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what
+    passes the gate is tried in, too.
     """
-    started, draft, is_doubted = time.perf_counter(), drafts[0], False
+    started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
     least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
+    archived = [start] if start.weights.refined else []
+    at_first = [(each, STRENGTHS[0]) for each in (*drafts[:1], *archived)]
+    later = [(each, gate) for gate, each in product(STRENGTHS[1:], (*drafts[:1], *archived))]
+    later += [(each, gate) for each, gate in product(drafts[1:], STRENGTHS)]
 
     def passing(tries: Sequence[tuple[FilterDraft, float]]) -> list[_Passing]:
         nonlocal draft, is_doubted
@@ -81,15 +93,16 @@ def gate_refined(
                     is_doubted = True
         return sorted(found, key=lambda each: -each.preference)
 
-    whole, *others = product(drafts, STRENGTHS)
-    for each in chain.from_iterable(map(passing, ([whole], others))):  # the others only where the whole is refused
+    for each in chain.from_iterable(map(passing, (at_first, later))):  # the later ones only where these are refused
         checked, _ = try_refined(problem, each.draft, each.gate, more_reference(), collect)
         draft = replace(draft, trials=(*draft.trials, checked))
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
             weights = each.draft.weights.changed(gate=each.gate)
             tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
-            draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, _REFINED))
+            note = _AS_IT_BEGAN if each.draft is start else _REFINED
+            draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, note))
             return draft.timed("gate_refined", started)
-    why = _DOUBTED if is_doubted else "The refined policy was no better on held-out scenarios and is off."
+    whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}
+    why = whys.get(True, "The refined policy was no better on held-out scenarios and is off.")
     draft = replace(draft, weights=draft.weights.changed(refined={}), notes=(*draft.notes, why))
     return draft.timed("gate_refined", started)
