@@ -7,8 +7,9 @@ finished is kept, and the last training goes on from its checkpoint, so an inter
 import json
 import platform
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,9 @@ from app.installed_tasks.by_name import usual_clip_steps
 from worker.compute import learning, shared_reward, simulation
 from worker.domain.scenarios import POOL, first_of
 from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import Act
+from worker.domain.type_aliases import Act, Float32Array
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.acquisition import matched_pairs
-from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.response_surface import ResponseSurface
@@ -75,7 +75,11 @@ ARCHETYPES = (
 
 
 def archive_policies(
-    task: str, work_directory: Path, archetypes: Sequence[Archetype] = ARCHETYPES, config: Refinement | None = None
+    task: str,
+    work_directory: Path,
+    archetypes: Sequence[Archetype] = ARCHETYPES,
+    config: Refinement | None = None,
+    gates: FilterConfig | None = None,
 ) -> dict[str, Any]:
     """Refine policies for people who mind one signal each, from which everybody's refinement may begin, and record it.
 
@@ -83,7 +87,7 @@ def archive_policies(
     """
     torch.set_num_threads(1)
     work_directory.mkdir(parents=True, exist_ok=True)
-    making = _Making(task, work_directory, config or Refinement())
+    making = _Making(task, work_directory, config or Refinement(), gates or FilterConfig())
     for number, archetype in enumerate(tqdm(archetypes, unit="policy")):
         making.refine(archetype, number)
     target = simulation.archive_folder(task)
@@ -105,8 +109,8 @@ def archive_policies(
 class _Making:
     """The archive of one task in the making."""
 
-    def __init__(self, task: str, work: Path, config: Refinement) -> None:
-        self.name, self.task, self.work, self.config = task, registry.task(task), work, config
+    def __init__(self, task: str, work: Path, config: Refinement, gates: FilterConfig) -> None:
+        self.name, self.task, self.work, self.config, self.gates = task, registry.task(task), work, config, gates
         self.rollouts = RolloutCache(task, work / "rollouts")
         self.pool = self.rollouts.pool(first_of(POOL, POOL_SCENARIOS))
         self.pairs, self.scale = self._shown()
@@ -117,35 +121,37 @@ class _Making:
         """Refine a policy for somebody, unless that is done; what is no better than where it began is not kept."""
         record, file = self.work / f"{archetype.name}.json", self.policy_file(archetype.name)
         if not record.exists():
-            problem = FilterProblem(self.task, simulation.reference_policy(self.name), self._reward(archetype), seed)
-            draft = self._refined(problem, self.work / f"{archetype.name}-training")
-            if kept := draft.weights.gate == 1.0 and bool(draft.weights.refined):
-                GaussianPolicy(dict(draft.weights.refined)).save(file)
-            tried = [asdict(trial) for trial in draft.trials]
-            record.write_text(json.dumps({**asdict(archetype), "kept": kept, "trials": tried}))
+            policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
+            problem = FilterProblem(self.task, policy, reward, seed, self.gates)
+            refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
+            if refined:
+                GaussianPolicy(dict(refined)).save(file)
+            record.write_text(json.dumps({**asdict(archetype), "kept": bool(refined), "trials": trials}))
         self.found.append(json.loads(record.read_text()))
         if file.exists():
-            policy, gate = GaussianPolicy.load(file), FilterConfig().gate_block(self.task)
+            policy, gate = GaussianPolicy.load(file), self.gates.gate_block(self.task)
             self.archived.append(ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0)))
 
     def policy_file(self, name: str) -> Path:
         """Where somebody's policy is kept."""
         return self.work / f"{name}.safetensors"
 
-    def _refined(self, problem: FilterProblem, folder: Path) -> FilterDraft:
+    def _refined(self, problem: FilterProblem, folder: Path) -> tuple[Mapping[str, Float32Array], list[dict[str, Any]]]:
+        """The policy's weights, none where it began as well as it ended, and what was tried."""
         config, reference = problem.config, self.rollouts.reference
         gate, watched = reference(config.gate_block(self.task)), reference(config.watch_block(self.task))
         surface = ResponseSurface.load(simulation.surface_file(self.name), self.task.modes, self.task.signals)
-        draft = find_mode(problem, surface, self.pool, gate, self._collect)
-        start = best_beginning(problem, draft, self.archived, gate)
+        mode = find_mode(problem, surface, self.pool, gate, self._collect)
+        start = best_beginning(problem, mode, self.archived, gate)
         folder.mkdir(exist_ok=True)
         beginning = Beginning(registry.environment_class(self.name), self.pool.rollouts, gate, watched, self._collect)
         drafts = refine(problem, start, beginning, self.config, Checkpoint(folder))
-        draft = gate_refined(
-            problem, draft, drafts, gate, lambda: reference(config.check_block(self.task)), self._collect
-        )
+        check = partial(reference, config.check_block(self.task))
+        gated = gate_refined(problem, start, drafts, gate, check, self._collect)
         shutil.rmtree(folder)
-        return draft
+        weights = gated.weights
+        is_new = weights.gate == 1.0 and weights.refined is not start.weights.refined
+        return weights.refined if is_new else {}, [asdict(trial) for trial in gated.trials]
 
     def _collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return learning.run_scenarios(self.name, act, scenarios, noise, seed)

@@ -1,5 +1,6 @@
 """Drafts survive being stored between two stages, and a filter that costs the task says so."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from tests.worker import invented
 from tests.worker.at_hand import AtHand
 from worker.analysis.filters.promise import Outcome
-from worker.compute import filter_finishing, filter_fitting, learning
+from worker.compute import filter_finishing, filter_fitting, learning, simulation
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.domain.trajectory import SIGNALS, Trajectory
@@ -123,6 +124,7 @@ def test_who_waits_for_the_rest_does_not_wait_for_scenarios_of_looks(
 ) -> None:
     steps, compute, config = 1_000, Drives(), FilterConfig()
     monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
+    monkeypatch.setattr(simulation, "archived_policies", lambda task: {})
     made = Refinement(steps).ahead_steps - (0 if ahead else 1)
     Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": made})
     task = registry.task("feeding")
@@ -134,3 +136,29 @@ def test_who_waits_for_the_rest_does_not_wait_for_scenarios_of_looks(
     known: list[Trajectory] = []
     assert fit.refine(FilterDraft(FilterWeights()), known, steps, tmp_path, nobody_needs_it) is None
     assert bool(compute.scenarios & set(config.watch_block(task))) == tried
+
+
+class Episodes(AtHand):
+    """Episodes of noise, and how many were driven by whom."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.driven = Counter[object]()
+
+    def run_all(self, lane: Lane, beat: Callable[[], None], function: Any, arguments: list[tuple[Any, ...]]) -> Any:
+        """See Compute."""
+        for _, act, scenarios, *_ in arguments:
+            self.driven[act.__self__] += len(scenarios)
+        return [[AtHome.episode(scenario) for scenario in scenarios] for _, _, scenarios, *_ in arguments]
+
+
+def test_what_archived_policies_do_is_driven_once_for_everybody(monkeypatch: pytest.MonkeyPatch) -> None:
+    policies, scenarios = {"level": invented.small_policy(1), "soon": invented.small_policy(2)}, FilterConfig()
+    monkeypatch.setattr(simulation, "archived_policies", lambda task: policies)
+    compute, references = Episodes(), dict[tuple[str, range], list[Trajectory]]()
+    count = len(scenarios.gate_block(invented.TASK))
+    for wish in (1.0, -1.0):
+        reward = StructuredReward(np.full((1, len(SIGNALS)), wish)).to_bytes()
+        fit = FilterFit("feeding", compute, lambda: None, reward, 0, scenarios, lambda stage, share: None, references)
+        fit._best_beginning(FilterDraft(FilterWeights()))
+        assert [compute.driven[each] for each in policies.values()] == [count, count]

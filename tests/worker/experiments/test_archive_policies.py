@@ -1,0 +1,60 @@
+"""Policies that are refined once for everybody: how they are made, and those that ship."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.installed_tasks import catalogue
+from app.installed_tasks.by_name import usual_refinement_steps
+from worker.compute import simulation
+from worker.experiments import archive_policies
+from worker.experiments.archive_policies import ARCHETYPES, Archetype
+from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_problem import FilterConfig
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.reinforcement.archived_policy import best_beginning
+from worker.ml.reinforcement.refinement import Refinement
+
+REFINED = [name for name in catalogue.names() if usual_refinement_steps(name)]
+FEW = FilterConfig(gate_scenarios=3, check_scenarios=2, watch_scenarios=1, mode_attempts=1, success_tolerance=1.0)
+SHORT = Refinement(steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=20, hidden=16)
+
+
+def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation, "archive_folder", lambda task: tmp_path / "refined")
+    monkeypatch.setattr(archive_policies, "POOL_SCENARIOS", 2)
+    began = list[int]()
+
+    def noting(*asked: Any) -> FilterDraft:
+        began.append(len(asked[2]))
+        return best_beginning(*asked)
+
+    monkeypatch.setattr(archive_policies, "best_beginning", noting)
+    make = (Archetype("even"), Archetype("level", "tilt_rad"))
+    record = archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW)
+    kept = [each["name"] for each in record["archetypes"] if each["kept"]]
+    assert began == [0, int("even" in kept)]
+    files = sorted(file.stem for file in (tmp_path / "refined").glob("*.safetensors"))
+    assert files == sorted(kept)
+    assert json.loads((tmp_path / "refined" / "archive.json").read_text()) == record
+    assert not list((tmp_path / "work").glob("*-training")), "what a training needs to go on is cleared away"
+
+    monkeypatch.setattr(archive_policies, "refine", lambda *_: pytest.fail("it was trained again"))
+    assert archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW) == record
+
+
+@pytest.mark.parametrize("task", REFINED)
+def test_every_task_that_is_refined_ships_with_the_policies_that_its_record_names(task: str) -> None:
+    record = json.loads((simulation.archive_folder(task) / "archive.json").read_text())
+    shipped = simulation.archived_policies(task)
+    assert shipped
+    assert sorted(shipped) == sorted(each["name"] for each in record["archetypes"] if each["kept"])
+    assert [each["name"] for each in record["archetypes"]] == [each.name for each in ARCHETYPES]
+    assert record["steps"] == Refinement().steps == usual_refinement_steps(task)
+    reference = simulation.reference_policy(task)
+    for policy in shipped.values():
+        assert isinstance(policy, GaussianPolicy)
+        assert policy.offset.tolist() == reference.weights["offset"].tolist()
+        assert policy.action_size == reference.action_size

@@ -1,0 +1,119 @@
+"""Policies refined beforehand: whose refinement begins as one of them, and when one of them is the filter."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.worker import invented
+from tests.worker.ml.test_methods import POLICY, REWARD, World, collect
+from worker.domain.trajectory import Trajectory
+from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.policies.gaussian import GaussianPolicy
+from worker.ml.reinforcement import refinement
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.refinement import Beginning, Refinement
+from worker.ml.reinforcement.refinement_gate import gate_refined
+from worker.ml.rewards.reward_models import StructuredReward
+
+SCENARIOS = range(6)
+NO_MODE = FilterDraft(FilterWeights())
+DISLIKES = FilterProblem(invented.TASK, POLICY, REWARD, 0, FilterConfig(success_tolerance=0.05))
+"""somebody who dislikes the first joint's action"""
+ONLY_IMITATED = Refinement(
+    steps=400, warm_up_steps=400, imitation_steps=1_500, critic_first_updates=10, hidden=64, environments=2
+)
+
+
+def moved(by: float) -> GaussianPolicy:
+    """The pre-trained policy with more of the first joint's action."""
+    weights = {name: array.copy() for name, array in POLICY.weights.items()}
+    weights["bias_2"][0] += by
+    return GaussianPolicy(weights)
+
+
+def archived(policy: GaussianPolicy, *, success: bool = True) -> ArchivedPolicy:
+    driven = collect(policy.mean, SCENARIOS, 0.0, 0)
+    return ArchivedPolicy(policy, [replace(each, success=success) for each in driven])
+
+
+@pytest.fixture(scope="module")
+def reference() -> list[Trajectory]:
+    torch.set_num_threads(1)
+    return [replace(each, success=True) for each in collect(POLICY.mean, SCENARIOS, 0.0, 0)]
+
+
+def succeeding(act: object, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    return [replace(each, success=True) for each in collect(act, scenarios, noise, seed)]  # type: ignore[arg-type]
+
+
+def test_it_begins_as_what_the_person_wants_most_of_what_keeps_the_task(reference: list[Trajectory]) -> None:
+    a_little, much, lost, liked = (
+        archived(moved(-0.3)),
+        archived(moved(-1.0)),
+        archived(moved(-2.0), success=False),
+        moved(1.0),
+    )
+    others = [a_little, much, lost, archived(liked)]
+    start = best_beginning(DISLIKES, NO_MODE, others, reference)
+    assert start.weights.refined is much.policy.weights
+    likes = replace(DISLIKES, reward=StructuredReward(-REWARD.weights))
+    assert best_beginning(likes, NO_MODE, others, reference).weights.refined is liked.weights
+
+
+def test_whose_own_mode_is_better_than_all_of_them_begins_as_that(reference: list[Trajectory]) -> None:
+    trial = GateTrial(1.0, 0.0, 99.0, 0.0, 0.0)
+    with_mode = FilterDraft(FilterWeights(mode={"speed_near": -0.3}), trials=(trial,))
+    assert best_beginning(DISLIKES, with_mode, [archived(moved(-1.0))], reference) is with_mode
+    assert best_beginning(DISLIKES, NO_MODE, [], reference) is NO_MODE
+    assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], reference) is NO_MODE
+
+
+def test_a_refinement_begins_as_the_archived_policy(reference: list[Trajectory]) -> None:
+    policy = moved(-1.0)
+    start = best_beginning(DISLIKES, NO_MODE, [archived(policy)], reference)
+    beginning = Beginning(World, [], reference, reference, collect)
+    (begun,) = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
+    seen = invented.observations(300, np.random.default_rng(9))
+    imitated = act_of(invented.TASK.modes, POLICY, begun.weights).batch(seen)
+    assert np.abs(imitated - policy.mean(seen)).mean() < 0.05
+    assert np.abs(imitated - POLICY.mean(seen)).mean() > 0.05
+
+
+@pytest.mark.parametrize(("learned", "is_own"), [(-1.5, True), (-0.5, False)])
+def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_better(
+    reference: list[Trajectory], learned: float, is_own: bool
+) -> None:
+    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
+    gated = gate_refined(DISLIKES, start, [own], reference, lambda: reference, succeeding)
+    assert gated.weights.refined is (own if is_own else start).weights.refined
+    assert ("found none better for this person" in gated.notes[-1]) != is_own
+    assert gated.tested
+
+
+def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: list[Trajectory]) -> None:
+    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    gated = gate_refined(DISLIKES, start, [], reference, lambda: reference, succeeding)
+    assert gated.weights.refined is start.weights.refined
+    none = gate_refined(DISLIKES, NO_MODE, [], reference, lambda: reference, succeeding)
+    assert not none.weights.refined
+    assert "given up" in none.notes[-1]
+
+
+def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(
+    reference: list[Trajectory],
+) -> None:
+    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
+
+    def failing_there(act: object, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        return [replace(each, success=each.scenario < 100) for each in succeeding(act, scenarios, noise, seed)]
+
+    gated = gate_refined(DISLIKES, start, [], reference, lambda: more, failing_there)
+    assert gated.weights == NO_MODE.weights
