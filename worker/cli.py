@@ -12,6 +12,8 @@ MODULES = {
     "import-clips": "service",
     "pretrain": "training",
     "explore": "training",
+    "archive": "training",
+    "archive-policies": "training",
     "foresee": "training",
     "start-posture": "new_task",
     "speed-weight": "new_task",

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +27,14 @@ OF_TERMS: options.Table = {
     "methods.from_scratch.steps": ("--pbrl-steps", "environment steps of PbRL-HRI"),
     "methods.printed_steps": ("--printed-steps", "gradient steps of the printed method"),
 }
+_HOW: Mapping[str, int] = {
+    "--work-directory": 1,
+    "--output": 1,
+    "--processes": 1,
+    "--on-workers": 0,
+    "--report-only": 0,
+}
+"""Options that change nothing of what is measured, and how many words follow them."""
 
 
 def add(commands: Commands) -> None:
@@ -65,6 +74,20 @@ def add(commands: Commands) -> None:
     command.set_defaults(act=_benchmark)
 
 
+def what_is_measured(words: Sequence[str]) -> list[str]:
+    """A command line without where and how it is worked on, which is nothing of a table's."""
+    kept, left_out = list[str](), 0
+    for word in words:
+        option, is_whole, _ = word.partition("=")
+        if option in _HOW:
+            left_out = 0 if is_whole else _HOW[option]
+        elif left_out:
+            left_out -= 1
+        else:
+            kept.append(word)
+    return kept
+
+
 def _benchmark(said: argparse.Namespace) -> int:
     terms = options.filled(benchmark.PROFILES[said.profile], OF_TERMS, said)
     others = [
@@ -77,7 +100,7 @@ def _benchmark(said: argparse.Namespace) -> int:
     settings = Settings()
     work = said.work_directory or experiments.work_directory(settings)
     output = said.output or (work / "quick" if said.profile == "quick" else Path("docs/results/all_methods"))
-    command = "python -m worker " + " ".join(sys.argv[1:] or ["benchmark"])
+    command = "python -m worker " + " ".join(what_is_measured(sys.argv[1:]) or ["benchmark"])
     run: benchmark.Run | None = partial(benchmark.on_this_machine, said.processes)
     if said.on_workers:
         run = partial(experiments.on_workers, settings, said.processes)

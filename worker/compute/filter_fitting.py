@@ -146,6 +146,7 @@ class FilterFit:
 
     def _best_beginning(self, draft: FilterDraft) -> FilterDraft:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
+        self.progress("comparing the mode with policies that were refined beforehand", 0.33)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
             driven = self._driven(f"{self.task} refined beforehand: {name}", policy, scenarios)

@@ -9,7 +9,7 @@ import pytest
 
 from worker import cli
 from worker.analysis.comparison.comparison_rows import compared
-from worker.commands import options
+from worker.commands import benchmarking, options
 from worker.experiments import benchmark, benchmark_cell
 from worker.experiments.benchmark import PROFILES, Selection
 from worker.experiments.benchmark_cell import OPPOSED_USERS, PAPER_USERS, BenchmarkConfig, Cell
@@ -144,6 +144,17 @@ def test_the_command_can_only_report(tmp_path: Path) -> None:
     arguments = ["benchmark", "--profile", "quick", "--report-only", "--work-directory", str(tmp_path)]
     assert cli.run(arguments) == 0
     assert not (tmp_path / "quick").exists()
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["", " --work-directory /somewhere --report-only", " --processes 1 --output=here/table", " --output here/table"],
+)
+def test_a_table_says_what_was_measured_and_not_on_whose_machine(how: str) -> None:
+    command = f"benchmark --methods reference pbarl{how} --tasks feeding --seeds 1"
+    assert benchmarking.what_is_measured(command.split()) == (
+        ["benchmark", "--methods", "reference", "pbarl", "--tasks", "feeding", "--seeds", "1"]
+    )
 
 
 @pytest.mark.parametrize("wrong", [["--mistakes", "5"], ["--mistakes", "nan"], ["--rationality", "0"]])
