@@ -63,14 +63,8 @@ ARCHETYPES = (
     Archetype("soon", "undelivered"),
     Archetype("smooth", "acceleration_squared_m2_s4"),
     Archetype("slow_near", "near_speed_squared_m2_s2"),
-    Archetype("straight", "lateral_offset_m"),
-    Archetype("wide", "lateral_offset_m", 1.0),
     Archetype("clean", "spilled"),
     Archetype("fast_near", "near_speed_squared_m2_s2", 1.0),
-    Archetype("from_below", "height_above_target_m"),
-    Archetype("close", "distance_m"),
-    Archetype("slow_intake", "intake_speed_m_s"),
-    Archetype("soft", "force_squared_n2"),
 )
 
 
