@@ -10,6 +10,7 @@ import torch
 from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, World, collect
 from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
@@ -22,6 +23,9 @@ from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.reward_models import StructuredReward
 
 SCENARIOS = range(6)
+CHECKED = range(100, 110)
+FAR = -0.67
+"""mean action of the first joint, which moved(-3.0) is below, in any state"""
 NO_MODE = FilterDraft(FilterWeights())
 DISLIKES = FilterProblem(invented.TASK, POLICY, REWARD, 0, FilterConfig(success_tolerance=0.05))
 """somebody who dislikes the first joint's action"""
@@ -48,8 +52,8 @@ def reference() -> list[Trajectory]:
     return [replace(each, success=True) for each in collect(POLICY.mean, SCENARIOS, 0.0, 0)]
 
 
-def succeeding(act: object, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-    return [replace(each, success=True) for each in collect(act, scenarios, noise, seed)]  # type: ignore[arg-type]
+def succeeding(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    return [replace(each, success=True) for each in collect(act, scenarios, noise, seed)]
 
 
 def test_it_begins_as_what_the_person_wants_most_of_what_keeps_the_task(reference: list[Trajectory]) -> None:
@@ -112,8 +116,29 @@ def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_fil
     start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
     more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
 
-    def failing_there(act: object, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    def failing_there(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=each.scenario < 100) for each in succeeding(act, scenarios, noise, seed)]
 
     gated = gate_refined(DISLIKES, start, [], reference, lambda: more, failing_there)
     assert gated.weights == NO_MODE.weights
+
+
+@pytest.mark.parametrize(("best_on_the_way", "is_own"), [(-1.4, True), (-0.8, False)])
+@pytest.mark.parametrize("lost_where", [SCENARIOS, CHECKED])
+def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_the_filter(
+    reference: list[Trajectory], lost_where: range, best_on_the_way: float, is_own: bool
+) -> None:
+    """Wherever that shows: in the gate's scenarios or in those of the check."""
+    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], reference)
+    last, best = (replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way))
+    more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """Whoever goes far loses the task."""
+        driven = collect(act, scenarios, noise, seed)
+        far = [each.actions[:, 0].mean() < FAR and each.scenario in lost_where for each in driven]
+        return [replace(each, success=not is_far) for each, is_far in zip(driven, far, strict=True)]
+
+    gated = gate_refined(DISLIKES, start, [last, best], reference, lambda: more, drive)
+    assert gated.weights.gate == 1.0
+    assert gated.weights.refined is (best if is_own else start).weights.refined

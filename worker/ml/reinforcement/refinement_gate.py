@@ -1,9 +1,9 @@
 """Whether a refined policy takes the filter's place, and how much of it."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, product
+from itertools import product
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
@@ -46,6 +46,10 @@ class _Passing:
     driven: Sequence[Trajectory]
 
 
+def _gain(passing: _Passing) -> float:
+    return passing.preference
+
+
 def try_refined(
     problem: FilterProblem, draft: FilterDraft, gate: float, reference: Sequence[Trajectory], collect: Collect
 ) -> tuple[GateTrial, Sequence[Trajectory]]:
@@ -68,9 +72,9 @@ def gate_refined(
 
     ``start``: with the archived policy that was the best beginning, which is one of those to choose from, or with the
     mode alone; ``drafts``: of refine(), none where that was given up. The whole last policy, which is mostly it, and
-    the archived one are tried first. Where neither is good enough, less of them and what had been best on the way are
-    tried. What gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what
-    passes the gate is tried in, too.
+    the archived one are tried first; if the better of them will not do, less of them and what had been best on the way
+    are, too, and what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check,
+    which what passes the gate is tried in, too.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
     least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
@@ -91,9 +95,17 @@ def gate_refined(
                     found.append(_Passing(trial.preference, candidate, gate, driven))
                 else:
                     is_doubted = True
-        return sorted(found, key=lambda each: -each.preference)
+        return found
 
-    for each in chain.from_iterable(map(passing, (at_first, later))):  # the later ones only where these are refused
+    def best_first() -> Iterator[_Passing]:
+        found = passing(at_first)
+        if not drafts or any(each.draft is drafts[0] for each in found):
+            found.sort(key=_gain)
+            yield from found[-1:]
+            del found[-1:]
+        yield from sorted([*found, *passing(later)], key=_gain, reverse=True)
+
+    for each in best_first():
         checked, _ = try_refined(problem, each.draft, each.gate, more_reference(), collect)
         draft = replace(draft, trials=(*draft.trials, checked))
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
