@@ -34,9 +34,12 @@ _OUR_TABLES = text("""
 """)
 _NOW = text("SELECT pg_snapshot_xmax(pg_current_snapshot())::text")
 _SOMEBODY_SEES_THE_PAST = text("""
-    SELECT EXISTS (SELECT FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()
-    AND greatest(age(backend_xmin), age(backend_xid)) > age(CAST(:moment AS xid8)::xid))
+    SELECT pg_snapshot_xmin(pg_current_snapshot()) < CAST(:moment AS xid8) OR EXISTS (
+    SELECT FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()
+    AND age(backend_xmin) > age(CAST(:moment AS xid8)::xid))
 """)
+"""Whoever reads in this database, and whoever writes in any of the server's: our own snapshot begins with the first of
+these, and what it could still see is copied as well."""
 
 
 def rewrite_tables(connections: Engine, patience_s: float) -> bool:

@@ -1,6 +1,7 @@
 """Who waits for whom: everybody for a writer, and only on PostgreSQL not participants for each other."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from sqlalchemy import select, text
@@ -9,6 +10,7 @@ from sqlalchemy.exc import OperationalError
 from app.db import Database, sqlite
 from app.settings import Settings
 from tests import databases
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -97,3 +99,23 @@ def test_nothing_is_rewritten_while_a_program_reads_all_the_time(database: Datab
         assert free_pages() > 0, "whoever wants to save an answer would have waited for that"
     assert database.forget_erased()
     assert free_pages() == 0
+
+
+@pytest.mark.skipif(databases.SERVER is None, reason="a file of SQLite holds one database")
+def test_rows_are_erased_from_files_though_somebody_writes_in_another_database_of_the_server(
+    database: Database, impatient: Database, settings: Settings, tmp_path: Path
+) -> None:
+    """Whose transaction is older than the erasure: what our own could still see by it would be copied as well."""
+    for statement in ("CREATE TABLE filler (content text)", "INSERT INTO filler VALUES ('erase-me')"):
+        with database.writing() as session:
+            session.execute(text(statement))
+    with databases.lent(tmp_path, with_tables=False) as elsewhere:
+        other = Database(elsewhere)
+        with other.writing() as writing:
+            writing.scalar(text("SELECT pg_current_xact_id()"))
+            with database.writing() as session:
+                session.execute(text("DELETE FROM filler"))
+            assert not impatient.forget_erased()
+        other.dispose()
+    assert until(database.forget_erased)
+    assert databases.tables_with([b"erase-me"], settings.sqlalchemy_url) == []
