@@ -86,7 +86,12 @@ def _archive(said: argparse.Namespace) -> int:
 
 def _archive_policies(said: argparse.Namespace) -> int:
     work = said.work_directory or Settings().data_dir / "archive-policies" / said.task
-    sys.stdout.write(json.dumps(archive_policies.archive_policies(said.task, work), indent=2) + "\n")
+    try:
+        record = archive_policies.archive_policies(said.task, work)
+    except (archive_policies.NothingToRefine, NotExplored) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
+    sys.stdout.write(json.dumps(record, indent=2) + "\n")
     return 0
 
 

@@ -46,6 +46,10 @@ ESPECIALLY = 2.0
 """times as much what is minded especially differs in a pair as everything else does, by the weights"""
 
 
+class NothingToRefine(ValueError):
+    """No policy can be refined for this task."""
+
+
 @dataclass(frozen=True)
 class Archetype:
     """Neutral but for one signal."""
@@ -78,7 +82,12 @@ def archive_policies(
     """Refine policies for people who mind one signal each, from which everybody's refinement may begin, and record it.
 
     Six to ten minutes for each of them, one after the other: every one begins as the best of those before.
+    Raises NothingToRefine for a laboratory's task, and for one without a response surface.
     """
+    if registry.task(task).is_a_labs:
+        raise NothingToRefine(f"{task} is a laboratory's task, whose filters are not refined.")
+    if not simulation.surface_file(task).exists():
+        raise NothingToRefine(f"There is no response surface; `python -m worker explore --task {task}` fits one.")
     torch.set_num_threads(1)
     work_directory.mkdir(parents=True, exist_ok=True)
     making = _Making(task, work_directory, config or Refinement(), gates or FilterConfig())

@@ -8,6 +8,7 @@ import pytest
 
 from app.installed_tasks import catalogue
 from app.installed_tasks.by_name import usual_refinement_steps
+from worker.__main__ import main
 from worker.compute import simulation
 from worker.experiments import archive_policies
 from worker.experiments.archive_policies import ARCHETYPES, Archetype
@@ -58,3 +59,12 @@ def test_an_archive_ships_with_the_policies_that_its_record_names(task: str) -> 
         assert isinstance(policy, GaussianPolicy)
         assert policy.offset.tolist() == reference.weights["offset"].tolist()
         assert policy.action_size == reference.action_size
+
+
+def test_a_task_that_was_not_explored_is_told_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(simulation, "surface_file", lambda task: tmp_path / "none.safetensors")
+    assert main(["archive-policies", "--task", "feeding", "--work-directory", str(tmp_path / "work")]) == 1
+    assert "`python -m worker explore --task feeding` fits one" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
