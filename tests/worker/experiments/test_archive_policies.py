@@ -1,6 +1,8 @@
 """Policies that are refined once for everybody: how they are made, and those that ship."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from worker.compute import simulation
 from worker.experiments import archive_policies
 from worker.experiments.archive_policies import ARCHETYPES, Archetype
 from worker.ml.filters.fitting.filter_draft import FilterDraft
-from worker.ml.filters.fitting.filter_problem import FilterConfig
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.archived_policy import best_beginning
 from worker.ml.reinforcement.refinement import Refinement
@@ -32,13 +34,17 @@ def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, mon
         began.append(len(asked[2]))
         return best_beginning(*asked)
 
+    def passing(problem: FilterProblem, start: FilterDraft, drafts: Sequence[FilterDraft], *_: Any) -> FilterDraft:
+        """So short a training makes nothing that the gate would let through."""
+        return replace(drafts[0], weights=drafts[0].weights.changed(gate=1.0 if len(began) < 3 else 0.8))
+
     monkeypatch.setattr(archive_policies, "best_beginning", noting)
-    make = (Archetype("even"), Archetype("level", "tilt_rad"))
+    monkeypatch.setattr(archive_policies, "gate_refined", passing)
+    make = (Archetype("even"), Archetype("level", "tilt_rad"), Archetype("wide", "lateral_offset_m", 1.0))
     record = archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW)
-    kept = [each["name"] for each in record["archetypes"] if each["kept"]]
-    assert began == [0, int("even" in kept)]
-    files = sorted(file.stem for file in (tmp_path / "refined").glob("*.safetensors"))
-    assert files == sorted(kept)
+    assert [each["kept"] for each in record["archetypes"]] == [True, True, False], "the last is no whole policy"
+    assert began == [0, 1, 2]
+    assert sorted(file.stem for file in (tmp_path / "refined").glob("*.safetensors")) == ["even", "level"]
     assert json.loads((tmp_path / "refined" / "archive.json").read_text()) == record
     assert not list((tmp_path / "work").glob("*-training")), "what a training needs to go on is cleared away"
 
