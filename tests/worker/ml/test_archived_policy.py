@@ -82,7 +82,7 @@ def test_a_refinement_begins_as_the_archived_policy(reference: list[Trajectory])
     policy = moved(-1.0)
     start = best_beginning(DISLIKES, NO_MODE, [archived(policy)], reference)
     beginning = Beginning(World, [], reference, reference, collect)
-    (begun,) = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
+    begun, *_ = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
     seen = invented.observations(300, np.random.default_rng(9))
     imitated = act_of(invented.TASK.modes, POLICY, begun.weights).batch(seen)
     assert np.abs(imitated - policy.mean(seen)).mean() < 0.05

@@ -95,7 +95,7 @@ def test_it_begins_as_the_filter_and_goes_where_the_person_wants_it(reference: l
     began = act_of(invented.TASK.modes, POLICY, GATED).batch(SEEN)
     imitated = act_of(invented.TASK.modes, POLICY, only_imitated[0].weights.changed(gate=1.0)).batch(SEEN)
     assert np.abs(imitated - began).mean() < 0.05
-    (learned,) = refined(draft, reference, LONGER)
+    learned, *_ = refined(draft, reference, LONGER)
     assert first_joint(learned.weights.changed(gate=1.0)) < first_joint(GATED) - 0.1
 
 
@@ -152,7 +152,7 @@ def test_a_refined_policy_that_loses_the_task_leaves_the_filter_as_it_was(refere
     draft = FilterDraft(GATED, trials=(GateTrial(0.6, 0.0, 0.01, 0.0, 0.0),))
     gated = gate_refined(strict, refined(draft, reference), succeeding, failing)
     assert gated.weights == GATED
-    assert [trial.gate for trial in gated.trials if trial.refined] == [1.0, 0.8, 0.6]
+    assert [trial.gate for trial in gated.trials if trial.refined] == [1.0, 0.8, 0.6] * 2
 
 
 def test_what_loses_the_task_in_more_scenarios_than_a_few_is_not_shipped(
@@ -280,6 +280,20 @@ def test_where_the_task_gets_lost_it_goes_back_and_the_task_gets_a_price(
     assert LOST < first_joint(best.weights) < first_joint(GATED) - 0.05
 
 
+def test_where_it_gets_no_better_it_goes_back(reference: list[Trajectory]) -> None:
+    """Where it is tried, the signals say the contrary of what they said while it learned."""
+
+    def contrary(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        return [replace(each, signals=-each.signals) for each in collect(act, scenarios, noise, seed)]
+
+    looking = replace(LONGER, first_tie=0.1, last_tie=0.1, hold_every_steps=250, share_ahead=1.0)
+    free = refined(FilterDraft(GATED), reference, looking)
+    held = refined(FilterDraft(GATED), reference, looking, drive=contrary)
+    went, best, stayed, began = (first_joint(each.weights) for each in (*free, *held))
+    assert went < best < began - 0.15
+    assert stayed > (went + began) / 2
+
+
 @pytest.mark.parametrize("lost", range(6))
 def test_where_the_whole_last_policy_loses_the_task_whatever_gains_most_is_next(
     reference: list[Trajectory], watched: tuple[FilterDraft, ...], lost: int
@@ -328,13 +342,14 @@ def test_what_was_begun_before_there_were_prices_is_gone_on_with(reference: list
     kept = checkpoint.read()
     assert kept is not None
     checkpoint.write({name: each for name, each in kept[0].items() if name not in {"price", "best_gain"}}, kept[1])
-    assert weights_of(refined(draft, reference, checkpoint=checkpoint)) == weights_of(refined(draft, reference))
+    last, *_ = weights_of(refined(draft, reference, checkpoint=checkpoint))
+    assert last == weights_of(refined(draft, reference))[0]
 
 
 def test_what_was_made_ahead_is_promising_only_to_whoever_likes_it(reference: list[Trajectory], tmp_path: Path) -> None:
     likes = problem(StructuredReward(-REWARD.weights))
     draft, beginning = FilterDraft(GATED), Beginning(World, [], reference, reference, collect)
-    config, checkpoint = replace(LONGER, share_ahead=0.9), Checkpoint(tmp_path)
+    config, checkpoint = replace(LONGER, share_ahead=0.9, hold_every_steps=300), Checkpoint(tmp_path)
     assert refinement.is_promising(problem(), draft, reference, config, checkpoint, collect), "nothing was made ahead"
     refinement.refine_ahead(problem(), draft, beginning, config, checkpoint)
     assert refinement.is_promising(problem(), draft, reference, config, checkpoint, collect)

@@ -1,9 +1,9 @@
 """The longest stage of the studio's filter: a policy of the person's own, which begins as the mode or an archived one.
 
 A network imitates what it begins as; soft actor-critic goes on from there, on R-hat and a sketchy reward (guided()).
-Its replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to what it
-was some time before, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets
-the task before it finds anything better. Where it forgets it all the same it goes back (docs/method.md, section 5).
+Its replay begins with the rollouts that are there already (Ball et al. 2023, arXiv 2302.02948). It is tied to the best
+it was so far, as prefft_anchored is to where it began, less and less while it learns: without a tie it forgets the task
+before it finds anything better. Where it got no better all the same it goes back (docs/method.md, section 5).
 """
 
 import hashlib
@@ -29,7 +29,8 @@ from worker.ml.policies.sac import Actor, Learner, SacConfig
 from worker.ml.reinforcement.guided_reward import guided, priced
 from worker.ml.reinforcement.preference_rl import MakeEnv, PreferenceRl, learned
 from worker.ml.reinforcement.refinement_gate import LARGEST_LOSS, try_refined
-from worker.ml.reinforcement.watched_learner import WatchedLearner, best_in, price_in
+from worker.ml.reinforcement.tied_learner import anchor_in
+from worker.ml.reinforcement.watched_learner import WatchedLearner, price_in
 
 LOOKED_AT = 40
 """of the gate's scenarios, to see whether a refinement is promising"""
@@ -54,14 +55,18 @@ class Refinement:
     hidden: int = 128
     environments: int = 4
     learning_rate: float = 5e-4
+    target_entropy: float = -14.0
+    """twice as far down as is usual for 7 joints: what begins well is worse with more noise, and is left (decision
+    193)"""
     first_tie: float = 1.0
     """weight of the KL divergence from what it is tied to, the imitation at first, in units of the spread of Q; see
     TiedLearner"""
     last_tie: float = 0.3
     hold_every_steps: int = 12_000
-    """the tie is to what the policy was then: it goes far, and never far at once; see WatchedLearner"""
+    """how often it is tried, and tied to what it has become or goes back: it goes far, and never far at once; see
+    WatchedLearner"""
     largest_loss: float = LARGEST_LOSS
-    """of success in the scenarios in which it is tried on the way; what loses more goes back"""
+    """of success in the scenarios in which it is tried on the way; what loses more has lost the task"""
     price: float = 0.5
     """of every step with the task undone, once it was lost, in standard deviations of R-hat"""
     stroke_weight: float = 0.3
@@ -139,7 +144,7 @@ def is_promising(
         return True
     policy = looked_into(problem.policy)
     actor = Actor(torch.from_numpy(policy.offset), torch.from_numpy(policy.scale), policy.action_size, config.hidden)
-    actor.load_state_dict(best_in(kept[0]))
+    actor.load_state_dict(anchor_in(kept[0]))
     trial, _ = try_refined(problem, _with(draft, actor), 1.0, reference[:LOOKED_AT], collect)
     return trial.preference > to_beat(problem, draft, reference)
 
@@ -161,6 +166,7 @@ def _train(
         environments=config.environments,
         hidden=config.hidden,
         learning_rate=config.learning_rate,
+        target_entropy=config.target_entropy,
         critic_first_updates=config.critic_first_updates if kept is None else config.critic_again_updates,
     )
     policy, reference, watched = looked_into(problem.policy), beginning.reference, beginning.watched
@@ -172,10 +178,6 @@ def _train(
         first_reward = priced(reward, price_in(kept[0]) if kept else 0.0)
         training = PreferenceRl(beginning.make_env, first_reward, settings, [*beginning.known, *reference], mark)
         learner = WatchedLearner(settings, offset, scale, training.actions, config.first_tie)
-        if kept is None:
-            _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
-        else:
-            training.restore(learner, *kept)
 
         def move_tie(training: PreferenceRl, _: Learner) -> None:
             learner.weight = config.first_tie + training.steps / config.steps * (config.last_tie - config.first_tie)
@@ -185,7 +187,7 @@ def _train(
                 look()
 
         def look() -> None:
-            """Hold it where it is, or go back."""
+            """Hold it where it is if that is better than ever before, or go back."""
             trial, _ = try_refined(problem, _with(draft, learner.average), 1.0, watched, beginning.collect)
             if keeps_task(problem, trial, watched) and trial.success_change >= -config.largest_loss:
                 learner.passed(trial.preference)
@@ -195,6 +197,11 @@ def _train(
                 for _ in range(config.critic_again_updates):
                     learner.update(training.replay, actor=False)
 
+        if kept is None:
+            _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
+            look()
+        else:
+            training.restore(learner, *kept)
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner

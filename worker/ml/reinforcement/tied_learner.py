@@ -38,8 +38,7 @@ class TiedLearner(Learner):
         """See Learner."""
         super().load_state(tensors, updates)
         self.hold()
-        names = [name for name in tensors if name.startswith("anchor.")]
-        self.anchor.load_state_dict({name.removeprefix("anchor."): tensors[name] for name in names})
+        self.anchor.load_state_dict(anchor_in(tensors))
         self._unit = float(tensors["unit"])
 
     def tie(self, states: Tensor) -> Tensor | float:
@@ -55,6 +54,11 @@ class TiedLearner(Learner):
         repeated = states.expand(10, *states.shape).reshape(-1, states.shape[-1])
         values = self.critics(repeated, self.anchor.sample(repeated)[0]).amin(0)
         return max(float(values.reshape(10, -1).std(dim=0).mean()), 1e-6)
+
+
+def anchor_in(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What the actor that it is held at is made of in a state of a learner."""
+    return {name.removeprefix("anchor."): tensors[name] for name in tensors if name.startswith("anchor.")}
 
 
 def gaussian_divergence(mean: Tensor, log_std: Tensor, other_mean: Tensor, other_log_std: Tensor) -> Tensor:
