@@ -173,7 +173,8 @@ def _train(
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
-        reward = guided(reference, learned(problem.reward), config.stroke_weight, config.force_price)
+        trusted = problem.reward.reaching(_driven_archived(problem, draft, beginning))
+        reward = guided(reference, learned(trusted), config.stroke_weight, config.force_price)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         first_reward = priced(reward, price_in(kept[0]) if kept else 0.0)
         training = PreferenceRl(beginning.make_env, first_reward, settings, [*beginning.known, *reference], mark)
@@ -205,6 +206,17 @@ def _train(
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
+
+
+def _driven_archived(problem: FilterProblem, draft: FilterDraft, beginning: Beginning) -> Sequence[Trajectory]:
+    """What the archived policy that it begins as does in the gate's scenarios; nothing where it begins as a mode.
+
+    Clips show modes. What such a policy does beyond them, and keeps the task with, has to count, or learning leaves it.
+    """
+    if not draft.weights.refined:
+        return ()
+    act = act_of(problem.task.modes, problem.policy, draft.weights)
+    return beginning.collect(act, [each.scenario for each in beginning.reference], 0.0, 0)
 
 
 def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:

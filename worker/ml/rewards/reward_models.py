@@ -23,6 +23,7 @@ from worker.domain.type_aliases import Float32Array, FloatArray
 from worker.ml import dense_network
 from worker.ml.rewards.bradley_terry import preference_logits, probability_right
 from worker.ml.rewards.segments import LEFT, RIGHT, SegmentPairs
+from worker.ml.rewards.signal_scale import usual
 
 UNDONE = "undelivered"
 NEVER_WANTED = (UNDONE, "spilled", "spilled_on_person", "high_force_n", "force_away_n", "action_change_squared")
@@ -95,6 +96,10 @@ class RewardModel(ABC):
         clips end before tasks do, so labels hardly say how much more anybody minds not being served at all.
         """
         return self._if_done(self._earned(signals, observations, actions), signals)
+
+    def reaching(self, shown: Sequence[Trajectory]) -> Self:
+        """The same, where what these trajectories do counts in episode_rewards(), too; for models with limits."""
+        return self
 
     def _if_done(self, rewards: FloatArray, signals: Float32Array) -> FloatArray:
         undone = self.undone_column is not None and signals[-1, self.undone_column] > 0.0
@@ -240,6 +245,15 @@ class StructuredReward(RewardModel):
         undeserved = self._undeserved(np.cumsum(known, axis=0))
         each_step = np.diff(undeserved, axis=0, prepend=np.zeros((1, self.size)))
         return self.normalised(self._linear(known) - each_step.T)
+
+    def reaching(self, shown: Sequence[Trajectory]) -> Self:
+        """See RewardModel; outliers excepted, as in what was shown to people."""
+        if self.least_per_step is None or self.most_per_step is None or not shown:
+            return self
+        known = [self.known_signals(each.signals, each.observations[: len(each)], each.actions) for each in shown]
+        low, high = usual(np.array([each.mean(axis=0) for each in known]))
+        least, most = np.minimum(self.least_per_step, low), np.maximum(self.most_per_step, high)
+        return replace(self, least_per_step=least, most_per_step=most)
 
     def _undeserved(self, totals: FloatArray) -> FloatArray:
         """What linear rewards pay for being beyond the limits, from the beginning to each step. totals (T, S) -> (T, E)

@@ -32,12 +32,13 @@ class SignalScale:
         shown = pairs.shown[..., None]
         width = pairs.signals.shape[-1]
         means = pairs.signals.mean(axis=2, dtype=np.float64, where=shown).reshape(-1, width)
-        bounds = [_usual(each) for each in (means, np.reshape(episode_means, (-1, width))) if len(each)]
+        bounds = [usual(each) for each in (means, np.reshape(episode_means, (-1, width))) if len(each)]
         least, most = np.min([low for low, _ in bounds], axis=0), np.max([high for _, high in bounds], axis=0)
         return cls(_spread_of(pairs.signal_differences()), least, most)
 
 
-def _usual(means: FloatArray) -> tuple[FloatArray, FloatArray]:
+def usual(means: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the most of each signal, (S,) both, in mean signals (N, S), outliers excepted."""
     low, high = np.quantile(means, [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE], axis=0)
     return low, high
 
