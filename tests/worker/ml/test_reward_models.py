@@ -322,6 +322,26 @@ def test_what_was_driven_is_judged_beyond_what_was_shown_if_the_task_got_done() 
     assert model.returns([]).shape == (0,)
 
 
+def test_limits_reach_as_far_as_what_an_archived_policy_does_and_no_further() -> None:
+    speed = SIGNALS.index("speed_m_s")
+    weights = np.zeros((8, len(SIGNALS)))
+    weights[:, speed] = -1.0
+    limit = np.full(len(SIGNALS), 0.1)
+    model = StructuredReward(weights, least_per_step=limit, most_per_step=limit)
+    rng = np.random.default_rng(0)
+    usual, calmer, calmest = (
+        invented.trajectory(rng, steps=15, signals=np.full((15, len(SIGNALS)), value, np.float32))
+        for value in (0.1, 0.04, 0.0)
+    )
+    reaching = model.reaching([calmer] * 5)
+    worth = [[each.rewards_of(driven).sum() for driven in (usual, calmer, calmest)] for each in (model, reaching)]
+    np.testing.assert_allclose(worth, [[-1.5, -1.5, -1.5], [-1.5, -0.6, -0.6]], rtol=1e-5)
+    assert model.reaching([]) is model
+    assert model.reaching([usual]).rewards_of(calmest).sum() == pytest.approx(-1.5)
+    unlimited = StructuredReward(weights)
+    assert unlimited.reaching([calmer]).rewards_of(calmest).sum() == pytest.approx(0.0)
+
+
 def test_whole_episodes_count_as_shown_beside_the_clips(labelled: tuple[SegmentPairs, np.ndarray]) -> None:
     clips = SignalScale.of(labelled[0])
     longer = SignalScale.of(labelled[0], [clips.least_per_step - 1.0, clips.most_per_step - 0.5])
