@@ -56,7 +56,7 @@ class Refinement:
     environments: int = 4
     learning_rate: float = 5e-4
     target_entropy: float = -14.0
-    """twice as far down as is usual for 7 joints: what begins well is worse with more noise, and is left (decision
+    """twice as far down as is usual for 7 joints: what is learned counts the noise, what is judged has none (decision
     193)"""
     first_tie: float = 1.0
     """weight of the KL divergence from what it is tied to, the imitation at first, in units of the spread of Q; see
@@ -173,8 +173,8 @@ def _train(
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
-        trusted = problem.reward.reaching(_driven_archived(problem, draft, beginning))
-        reward = guided(reference, learned(trusted), config.stroke_weight, config.force_price)
+        reaching = problem.reward.reaching(_driven_archived(problem, draft, beginning))
+        reward = guided(reference, learned(reaching), config.stroke_weight, config.force_price)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         first_reward = priced(reward, price_in(kept[0]) if kept else 0.0)
         training = PreferenceRl(beginning.make_env, first_reward, settings, [*beginning.known, *reference], mark)
@@ -211,7 +211,7 @@ def _train(
 def _driven_archived(problem: FilterProblem, draft: FilterDraft, beginning: Beginning) -> Sequence[Trajectory]:
     """What the archived policy that it begins as does in the gate's scenarios; nothing where it begins as a mode.
 
-    Clips show modes. What such a policy does beyond them, and keeps the task with, has to count, or learning leaves it.
+    Clips show modes. What such a policy does beyond them, and keeps the task with, has to count, or learning may leave it.
     """
     if not draft.weights.refined:
         return ()
