@@ -211,7 +211,7 @@ def _train(
 def _driven_archived(problem: FilterProblem, draft: FilterDraft, beginning: Beginning) -> Sequence[Trajectory]:
     """What the archived policy that it begins as does in the gate's scenarios; nothing where it begins as a mode.
 
-    Clips show modes. What such a policy does beyond them, and keeps the task with, has to count, or learning may leave it.
+    Clips show modes. What such a policy does beyond them has to count, or learning may leave it.
     """
     if not draft.weights.refined:
         return ()
