@@ -115,14 +115,13 @@ class FilterFit:
         a folder for checkpoints, in a compute process, until that gives drafts.
         """
         is_ahead = begun is not None and refining.is_ahead(begun, Refinement(steps))
-        start = self._best_beginning(draft)
-        training = self._training(draft if is_ahead else start, known, steps, watched=not is_ahead)
+        training = self._training(draft, known, steps, watched=not is_ahead)
         drafts: tuple[FilterDraft, ...] = ()
         if not (begun and is_ahead) or self._is_promising(training, begun):
             drafts = train(partial(refining.train, training, begun)) or ()
             if not drafts:
                 return None
-        reference = training.reference
+        start, reference = training.draft, training.reference
         return gate_refined(self.problem, start, drafts, reference, self._check_reference, self.collect, self.progress)
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
@@ -133,18 +132,19 @@ class FilterFit:
     def refine_ahead(self, pool: Pool, steps: int, train: TrainPatiently[bool]) -> None:
         """The larger part of a refinement, around this reward model's mode."""
         self._check_reference()  # while nobody waits for it
-        training = self._training(self._best_beginning(self.find_mode(pool)), pool.rollouts, steps, watched=True)
+        training = self._training(self.find_mode(pool), pool.rollouts, steps, watched=True)
         train(partial(refining.train_ahead, training))
 
     def _training(
-        self, draft: FilterDraft, known: Sequence[Trajectory], steps: int, *, watched: bool
+        self, mode: FilterDraft, known: Sequence[Trajectory], steps: int, *, watched: bool
     ) -> refining.Training:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        return refining.Training(self.task, self.problem, draft, known, reference, looks, config)
+        draft, archived = self._best_beginning(mode)
+        return refining.Training(self.task, self.problem, draft, archived, known, reference, looks, config)
 
-    def _best_beginning(self, draft: FilterDraft) -> FilterDraft:
+    def _best_beginning(self, draft: FilterDraft) -> tuple[FilterDraft, Sequence[Trajectory]]:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
         self.progress("comparing the mode with policies that were refined beforehand", 0.33)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []

@@ -18,11 +18,12 @@ from worker.tasks import registry
 
 @dataclass(frozen=True)
 class Training:
-    """What is refined, and with what; see refine()."""
+    """What is refined, and with what; see refine() and Beginning."""
 
     task: str
     problem: FilterProblem
     draft: FilterDraft
+    archived: Sequence[Trajectory]
     known: Sequence[Trajectory]
     reference: Sequence[Trajectory]
     watched: Sequence[Trajectory]
@@ -66,4 +67,4 @@ def is_ahead(folder: Path, config: Refinement) -> bool:
 def _beginning(training: Training) -> Beginning:
     collect = partial(run_scenarios, training.task)
     make_env = registry.environment_class(training.task)
-    return Beginning(make_env, training.known, training.reference, training.watched, collect)
+    return Beginning(make_env, training.known, training.reference, training.watched, collect, training.archived)

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from worker.analysis.filters.promise import Outcome
 from worker.compute import filter_finishing, filter_fitting, learning, simulation
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
+from worker.compute.refining import Training
 from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import limits_of
@@ -136,6 +138,26 @@ def test_who_waits_for_the_rest_does_not_wait_for_scenarios_of_looks(
     known: list[Trajectory] = []
     assert fit.refine(FilterDraft(FilterWeights()), known, steps, tmp_path, nobody_needs_it) is None
     assert bool(compute.scenarios & set(config.watch_block(task))) == tried
+
+
+@pytest.mark.parametrize("is_ahead", [True, False])
+def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_ahead: bool
+) -> None:
+    steps, trained = 1_000, list[Training]()
+    Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": Refinement(steps).ahead_steps if is_ahead else 0})
+    begins = FilterDraft(FilterWeights(refined=invented.small_policy(1).weights)), [AtHome.episode(7)]
+    monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
+    monkeypatch.setattr(filter_fitting, "best_beginning", lambda *_: begins)
+    reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
+    fit = FilterFit("feeding", Drives(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
+
+    def noted(part: Callable[[Path], Sequence[FilterDraft]]) -> None:
+        assert isinstance(part, partial)
+        trained.append(part.args[0])
+
+    fit.refine(FilterDraft(FilterWeights()), list[Trajectory](), steps, tmp_path, noted)
+    assert [(each.draft, each.archived) for each in trained] == [begins]
 
 
 class Episodes(AtHand):

@@ -12,6 +12,7 @@ from app.installed_tasks import catalogue
 from app.installed_tasks.by_name import usual_refinement_steps
 from worker.__main__ import main
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
 from worker.experiments import archive_policies
 from worker.experiments.archive_policies import ARCHETYPES, Archetype
 from worker.ml.filters.fitting.filter_draft import FilterDraft
@@ -30,7 +31,7 @@ def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, mon
     monkeypatch.setattr(archive_policies, "POOL_SCENARIOS", 2)
     began = list[int]()
 
-    def noting(*asked: Any) -> FilterDraft:
+    def noting(*asked: Any) -> tuple[FilterDraft, Sequence[Trajectory]]:
         began.append(len(asked[2]))
         return best_beginning(*asked)
 

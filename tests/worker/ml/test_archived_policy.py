@@ -64,23 +64,24 @@ def test_it_begins_as_what_the_person_wants_most_of_what_keeps_the_task(referenc
         moved(1.0),
     )
     others = [a_little, much, lost, archived(liked)]
-    start = best_beginning(DISLIKES, NO_MODE, others, reference)
+    start, driven = best_beginning(DISLIKES, NO_MODE, others, reference)
     assert start.weights.refined is much.policy.weights
+    assert driven is much.driven
     likes = replace(DISLIKES, reward=StructuredReward(-REWARD.weights))
-    assert best_beginning(likes, NO_MODE, others, reference).weights.refined is liked.weights
+    assert best_beginning(likes, NO_MODE, others, reference)[0].weights.refined is liked.weights
 
 
 def test_whose_own_mode_is_better_than_all_of_them_begins_as_that(reference: list[Trajectory]) -> None:
     trial = GateTrial(1.0, 0.0, 99.0, 0.0, 0.0)
     with_mode = FilterDraft(FilterWeights(mode={"speed_near": -0.3}), trials=(trial,))
-    assert best_beginning(DISLIKES, with_mode, [archived(moved(-1.0))], reference) is with_mode
-    assert best_beginning(DISLIKES, NO_MODE, [], reference) is NO_MODE
-    assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], reference) is NO_MODE
+    assert best_beginning(DISLIKES, with_mode, [archived(moved(-1.0))], reference) == (with_mode, [])
+    assert best_beginning(DISLIKES, NO_MODE, [], reference) == (NO_MODE, [])
+    assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], reference) == (NO_MODE, [])
 
 
 def test_a_refinement_begins_as_the_archived_policy(reference: list[Trajectory]) -> None:
     policy = moved(-1.0)
-    start = best_beginning(DISLIKES, NO_MODE, [archived(policy)], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(policy)], reference)
     beginning = Beginning(World, [], reference, reference, collect)
     begun, *_ = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
     seen = invented.observations(300, np.random.default_rng(9))
@@ -93,7 +94,7 @@ def test_a_refinement_begins_as_the_archived_policy(reference: list[Trajectory])
 def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_better(
     reference: list[Trajectory], learned: float, is_own: bool
 ) -> None:
-    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
     own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
     gated = gate_refined(DISLIKES, start, [own], reference, lambda: reference, succeeding)
     assert gated.weights.refined is (own if is_own else start).weights.refined
@@ -102,7 +103,7 @@ def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_b
 
 
 def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: list[Trajectory]) -> None:
-    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
     gated = gate_refined(DISLIKES, start, [], reference, lambda: reference, succeeding)
     assert gated.weights.refined is start.weights.refined
     none = gate_refined(DISLIKES, NO_MODE, [], reference, lambda: reference, succeeding)
@@ -113,7 +114,7 @@ def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: 
 def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(
     reference: list[Trajectory],
 ) -> None:
-    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
     more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
 
     def failing_there(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -129,7 +130,7 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
     reference: list[Trajectory], lost_where: range, best_on_the_way: float, is_own: bool
 ) -> None:
     """Wherever that shows: in the gate's scenarios or in those of the check."""
-    start = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], reference)
     last, best = (replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way))
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
 

@@ -173,13 +173,14 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
-        refinement.refine_ahead(early, best_beginning(early, mode, archived, reference), beginning, config, checkpoint)
+        start, driven = best_beginning(early, mode, archived, reference)
+        refinement.refine_ahead(early, start, replace(beginning, archived=driven), config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
+            start, driven = best_beginning(problem, draft, archived, reference)
             drafts: tuple[FilterDraft, ...] = ()
             if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
-                drafts = refinement.refine(problem, draft, beginning, config, checkpoint)
-            start = best_beginning(problem, draft, archived, reference)
+                drafts = refinement.refine(problem, start, replace(beginning, archived=driven), config, checkpoint)
             return gate_refined(problem, start, drafts, reference, more_reference, setting.collect)
 
         return _shipped(setting, _fitted(setting, refined))

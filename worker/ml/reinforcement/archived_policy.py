@@ -29,14 +29,17 @@ def best_beginning(
     draft: FilterDraft,
     archived: Sequence[ArchivedPolicy],
     reference: Sequence[Trajectory],
-) -> FilterDraft:
+) -> tuple[FilterDraft, Sequence[Trajectory]]:
     """The draft with the archived policy that the reward model likes best, or as it is where its mode is better yet.
 
-    ``reference``: of the frozen policy in the gate's scenarios.
+    Also what that policy does in the gate's scenarios, nothing where it is the mode. ``reference``: of the frozen
+    policy there.
     """
     best, most = draft, to_beat(problem, draft, reference)
+    driven: Sequence[Trajectory] = []
     for each in archived:
         trial = trial_of(problem, 1.0, 0.0, reference, each.driven)
         if trial.preference > most and keeps_task(problem, trial, reference):
-            best, most = replace(draft, weights=draft.weights.changed(refined=each.policy.weights)), trial.preference
-    return best
+            best = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
+            driven, most = each.driven, trial.preference
+    return best, driven

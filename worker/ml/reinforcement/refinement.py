@@ -94,6 +94,9 @@ class Beginning:
     watched: Sequence[Trajectory]
     """of the frozen policy in the scenarios in which it is tried on the way: what the task is kept by"""
     collect: Collect
+    archived: Sequence[Trajectory] = ()
+    """of the archived policy that it begins as, in the gate's scenarios. Clips show modes; what such a policy does
+    beyond them has to count, or learning may leave it"""
 
 
 def refine_ahead(
@@ -173,7 +176,7 @@ def _train(
     offset, scale = torch.from_numpy(policy.offset), torch.from_numpy(policy.scale)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(problem.seed)
-        reaching = problem.reward.reaching(_driven_archived(problem, draft, beginning))
+        reaching = problem.reward.reaching(beginning.archived)
         reward = guided(reference, learned(reaching), config.stroke_weight, config.force_price)
         mark = hashlib.sha256(problem.reward.to_bytes()).hexdigest()
         first_reward = priced(reward, price_in(kept[0]) if kept else 0.0)
@@ -206,17 +209,6 @@ def _train(
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
-
-
-def _driven_archived(problem: FilterProblem, draft: FilterDraft, beginning: Beginning) -> Sequence[Trajectory]:
-    """What the archived policy that it begins as does in the gate's scenarios; nothing where it begins as a mode.
-
-    Clips show modes. What such a policy does beyond them has to count, or learning may leave it.
-    """
-    if not draft.weights.refined:
-        return ()
-    act = act_of(problem.task.modes, problem.policy, draft.weights)
-    return beginning.collect(act, [each.scenario for each in beginning.reference], 0.0, 0)
 
 
 def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
