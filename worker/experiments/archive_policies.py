@@ -1,7 +1,8 @@
 """Refines policies once for everybody, from which refinements begin: ``python -m worker archive-policies --task NAME``.
 
-Each is for somebody who minds one signal especially, and begins as the best that was found for those before. What is
-finished is kept, and the last training goes on from its checkpoint, so an interrupted run goes on where it was.
+Each is for somebody who minds one signal especially, and begins as the best that was found for anybody. What is
+finished is archived at once, and the last training goes on from its checkpoint, so an interrupted run goes on where it
+was; with another work directory, what is archived already is improved.
 """
 
 import json
@@ -81,7 +82,9 @@ def archive_policies(
 ) -> dict[str, Any]:
     """Refine policies for people who mind one signal each, from which everybody's refinement may begin, and record it.
 
-    Six to ten minutes for each of them, one after the other: every one begins as the best of those before.
+    Six to twenty minutes for each of them, one after the other: every one begins as the best of all that are archived,
+    and takes the place of that person's earlier one if it ends better than it began. Who is finished in the work
+    directory is not refined again.
     Raises NothingToRefine for a laboratory's task, and for one without a response surface.
     """
     if registry.task(task).is_a_labs:
@@ -93,20 +96,7 @@ def archive_policies(
     making = _Making(task, work_directory, config or Refinement(), gates or FilterConfig())
     for number, archetype in enumerate(tqdm(archetypes, unit="policy")):
         making.refine(archetype, number)
-    target = simulation.archive_folder(task)
-    shutil.rmtree(target, ignore_errors=True)
-    target.mkdir(parents=True)
-    for each in making.found:
-        if each["kept"]:
-            shutil.copy(making.policy_file(each["name"]), target)
-    record = {
-        "command": f"python -m worker archive-policies --task {task}",
-        "steps": making.config.steps,
-        "archetypes": making.found,
-        "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
-    }
-    (target / "archive.json").write_text(json.dumps(record, indent=2) + "\n")
-    return record
+    return making.record()
 
 
 class _Making:
@@ -117,27 +107,44 @@ class _Making:
         self.rollouts = RolloutCache(task, work / "rollouts")
         self.pool = self.rollouts.pool(first_of(POOL, POOL_SCENARIOS))
         self.pairs, self.scale = self._shown()
-        self.archived: list[ArchivedPolicy] = []
-        self.found: list[dict[str, Any]] = []
+        self.folder = simulation.archive_folder(task)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.archived = {file.stem: self._driven(file) for file in sorted(self.folder.glob("*.safetensors"))}
+        known = json.loads(self._record_file.read_text())["archetypes"] if self._record_file.exists() else []
+        self.entries: dict[str, dict[str, Any]] = {each["name"]: each for each in known}
 
     def refine(self, archetype: Archetype, seed: int) -> None:
-        """Refine a policy for somebody, unless that is done; what is no better than where it began is not kept."""
-        record, file = self.work / f"{archetype.name}.json", self.policy_file(archetype.name)
-        if not record.exists():
+        """Refine a policy for somebody, unless that is done, and archive it if it is better than where it began."""
+        done, file = self.work / f"{archetype.name}.json", self.work / f"{archetype.name}.safetensors"
+        if not done.exists():
             policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
             problem = FilterProblem(self.task, policy, reward, seed, self.gates)
             refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
             if refined:
                 GaussianPolicy(dict(refined)).save(file)
-            record.write_text(json.dumps({**asdict(archetype), "kept": bool(refined), "trials": trials}))
-        self.found.append(json.loads(record.read_text()))
+            done.write_text(json.dumps({**asdict(archetype), "trials": trials}))
         if file.exists():
-            policy, gate = GaussianPolicy.load(file), self.gates.gate_block(self.task)
-            self.archived.append(ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0)))
+            self.archived[archetype.name] = self._driven(Path(shutil.copy(file, self.folder)))
+        kept = archetype.name in self.archived
+        self.entries[archetype.name] = {**json.loads(done.read_text()), "kept": kept}
+        self._record_file.write_text(json.dumps(self.record(), indent=2) + "\n")
 
-    def policy_file(self, name: str) -> Path:
-        """Where somebody's policy is kept."""
-        return self.work / f"{name}.safetensors"
+    def record(self) -> dict[str, Any]:
+        """How the archive came to be; the trials are those of the last training for each of them."""
+        return {
+            "command": f"python -m worker archive-policies --task {self.name}",
+            "steps": self.config.steps,
+            "archetypes": list(self.entries.values()),
+            "versions": {"python": platform.python_version(), "numpy": np.__version__, "torch": torch.__version__},
+        }
+
+    @property
+    def _record_file(self) -> Path:
+        return self.folder / "archive.json"
+
+    def _driven(self, file: Path) -> ArchivedPolicy:
+        policy, gate = GaussianPolicy.load(file), self.gates.gate_block(self.task)
+        return ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0))
 
     def _refined(self, problem: FilterProblem, folder: Path) -> tuple[Mapping[str, Float32Array], list[dict[str, Any]]]:
         """The policy's weights, none where it began as well as it ended, and what was tried."""
@@ -145,7 +152,7 @@ class _Making:
         gate, watched = reference(config.gate_block(self.task)), reference(config.watch_block(self.task))
         surface = ResponseSurface.load(simulation.surface_file(self.name), self.task.modes, self.task.signals)
         mode = find_mode(problem, surface, self.pool, gate, self._collect)
-        start, archived = best_beginning(problem, mode, self.archived, gate)
+        start, archived = best_beginning(problem, mode, list(self.archived.values()), gate)
         folder.mkdir(exist_ok=True)
         make_env = registry.environment_class(self.name)
         beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, archived)

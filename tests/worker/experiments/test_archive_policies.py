@@ -26,7 +26,9 @@ FEW = FilterConfig(gate_scenarios=3, check_scenarios=2, watch_scenarios=1, mode_
 SHORT = Refinement(steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=20, hidden=16)
 
 
-def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(simulation, "archive_folder", lambda task: tmp_path / "refined")
     monkeypatch.setattr(archive_policies, "POOL_SCENARIOS", 2)
     began = list[int]()
@@ -37,7 +39,7 @@ def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, mon
 
     def passing(problem: FilterProblem, start: FilterDraft, drafts: Sequence[FilterDraft], *_: Any) -> FilterDraft:
         """So short a training makes nothing that the gate would let through."""
-        return replace(drafts[0], weights=drafts[0].weights.changed(gate=1.0 if len(began) < 3 else 0.8))
+        return replace(drafts[0], weights=drafts[0].weights.changed(gate=0.8 if len(began) == 3 else 1.0))
 
     monkeypatch.setattr(archive_policies, "best_beginning", noting)
     monkeypatch.setattr(archive_policies, "gate_refined", passing)
@@ -49,8 +51,19 @@ def test_policies_are_made_one_after_the_other_and_each_once(tmp_path: Path, mon
     assert json.loads((tmp_path / "refined" / "archive.json").read_text()) == record
     assert not list((tmp_path / "work").glob("*-training")), "what a training needs to go on is cleared away"
 
-    monkeypatch.setattr(archive_policies, "refine", lambda *_: pytest.fail("it was trained again"))
-    assert archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW) == record
+    with monkeypatch.context() as patched:
+        patched.setattr(archive_policies, "refine", lambda *_: pytest.fail("it was trained again"))
+        assert archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW) == record
+
+    even, level = ((tmp_path / "refined" / f"{name}.safetensors").read_bytes() for name in ("even", "level"))
+    (tmp_path / "work" / "level.json").unlink()
+    again = archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
+    assert began == [0, 1, 2, 2], "whoever is refined again begins as the best of all that are there"
+    assert [(each["name"], each["kept"]) for each in again["archetypes"]] == [
+        (each["name"], each["kept"]) for each in record["archetypes"]
+    ]
+    assert (tmp_path / "refined" / "even.safetensors").read_bytes() == even
+    assert (tmp_path / "refined" / "level.safetensors").read_bytes() != level
 
 
 @pytest.mark.parametrize("task", ARCHIVES)
