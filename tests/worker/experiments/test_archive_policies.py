@@ -23,7 +23,14 @@ from worker.ml.reinforcement.refinement import Refinement
 
 ARCHIVES = [name for name in catalogue.names() if simulation.archive_folder(name).exists()]
 FEW = FilterConfig(gate_scenarios=3, check_scenarios=2, watch_scenarios=1, mode_attempts=1, success_tolerance=1.0)
-SHORT = Refinement(steps=2_400, warm_up_steps=800, imitation_steps=200, critic_first_updates=20, hidden=16)
+SHORT = Refinement(
+    steps=1_200,
+    warm_up_steps=400,
+    imitation_steps=100,
+    critic_first_updates=20,
+    critic_again_updates=20,
+    hidden=16,
+)
 
 
 def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
@@ -72,7 +79,7 @@ def test_an_archive_ships_with_the_policies_that_its_record_names(task: str) -> 
     shipped = simulation.archived_policies(task)
     assert shipped
     assert sorted(shipped) == sorted(each["name"] for each in record["archetypes"] if each["kept"])
-    assert [each["name"] for each in record["archetypes"]] == [each.name for each in ARCHETYPES]
+    assert {each["name"] for each in record["archetypes"]} <= {each.name for each in ARCHETYPES}
     assert record["steps"] == Refinement().steps == usual_refinement_steps(task)
     reference = simulation.reference_policy(task)
     for policy in shipped.values():
