@@ -20,12 +20,13 @@ from tqdm import tqdm
 
 from app.installed_tasks.by_name import usual_clip_steps
 from worker.compute import learning, shared_reward, simulation
-from worker.domain.scenarios import POOL, first_of
+from worker.domain.scenarios import POLICY_TEST, POOL, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.acquisition import matched_pairs
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.gate import successes
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
@@ -43,6 +44,9 @@ from worker.tasks import registry
 
 POOL_SCENARIOS = 48
 """each in six behaviours, as in a study: what the replays begin with"""
+TEST_SCENARIOS = 500
+LARGEST_LOSS = 0.005
+"""of success in these: half of what somebody's own may lose in fewer, as what is archived is there for everybody"""
 ESPECIALLY = 2.0
 """times as much what is minded especially differs in a pair as everything else does, by the weights"""
 
@@ -120,9 +124,10 @@ class _Making:
             policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
             problem = FilterProblem(self.task, policy, reward, seed, self.gates)
             refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
-            if refined:
+            loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
+            if loss is not None and loss <= LARGEST_LOSS:
                 GaussianPolicy(dict(refined)).save(file)
-            done.write_text(json.dumps({**asdict(archetype), "trials": trials}))
+            done.write_text(json.dumps({**asdict(archetype), "trials": trials, "loss": loss}))
         if file.exists():
             self.archived[archetype.name] = self._driven(Path(shutil.copy(file, self.folder)))
         kept = archetype.name in self.archived
@@ -145,6 +150,12 @@ class _Making:
     def _driven(self, file: Path) -> ArchivedPolicy:
         policy, gate = GaussianPolicy.load(file), self.gates.gate_block(self.task)
         return ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0))
+
+    def _loss(self, policy: GaussianPolicy) -> float:
+        """Of success, as a share of scenarios in which nothing was tried before."""
+        test = first_of(POLICY_TEST, TEST_SCENARIOS)
+        changes = successes(self._collect(PolicyAct(policy), test, 0.0, 0)) - successes(self.rollouts.reference(test))
+        return -float(changes.mean())
 
     def _refined(self, problem: FilterProblem, folder: Path) -> tuple[Mapping[str, Float32Array], list[dict[str, Any]]]:
         """The policy's weights, none where it began as well as it ended, and what was tried."""

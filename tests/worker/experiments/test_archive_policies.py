@@ -38,6 +38,8 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
 ) -> None:
     monkeypatch.setattr(simulation, "archive_folder", lambda task: tmp_path / "refined")
     monkeypatch.setattr(archive_policies, "POOL_SCENARIOS", 2)
+    monkeypatch.setattr(archive_policies, "TEST_SCENARIOS", 1)
+    monkeypatch.setattr(archive_policies, "LARGEST_LOSS", 1.0)
     began = list[int]()
 
     def noting(*asked: Any) -> tuple[FilterDraft, Sequence[Trajectory]]:
@@ -70,7 +72,13 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
         (each["name"], each["kept"]) for each in record["archetypes"]
     ]
     assert (tmp_path / "refined" / "even.safetensors").read_bytes() == even
-    assert (tmp_path / "refined" / "level.safetensors").read_bytes() != level
+    improved = (tmp_path / "refined" / "level.safetensors").read_bytes()
+    assert improved != level
+
+    monkeypatch.setattr(archive_policies, "LARGEST_LOSS", -2.0)
+    (tmp_path / "work" / "level.json").unlink()
+    archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
+    assert (tmp_path / "refined" / "level.safetensors").read_bytes() == improved, "what loses the task is not archived"
 
 
 @pytest.mark.parametrize("task", ARCHIVES)
