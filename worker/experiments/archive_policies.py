@@ -119,20 +119,20 @@ class _Making:
 
     def refine(self, archetype: Archetype, seed: int) -> None:
         """Refine a policy for somebody, unless that is done, and archive it if it is better than where it began."""
-        done, file = self.work / f"{archetype.name}.json", self.work / f"{archetype.name}.safetensors"
-        if not done.exists():
-            policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
-            problem = FilterProblem(self.task, policy, reward, seed, self.gates)
-            refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
-            loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
-            if loss is not None and loss <= LARGEST_LOSS:
-                GaussianPolicy(dict(refined)).save(file)
-            done.write_text(json.dumps({**asdict(archetype), "trials": trials, "loss": loss}))
-        if file.exists():
-            self.archived[archetype.name] = self._driven(Path(shutil.copy(file, self.folder)))
-        kept = archetype.name in self.archived
-        self.entries[archetype.name] = {**json.loads(done.read_text()), "kept": kept}
+        name, done = archetype.name, self.work / f"{archetype.name}-done"
+        if done.exists() and name in self.entries:
+            return
+        policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
+        problem = FilterProblem(self.task, policy, reward, seed, self.gates)
+        refined, trials = self._refined(problem, self.work / f"{name}-training")
+        loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
+        if loss is not None and loss <= LARGEST_LOSS:
+            file = self.folder / f"{name}.safetensors"
+            GaussianPolicy(dict(refined)).save(file)
+            self.archived[name] = self._driven(file)
+        self.entries[name] = {**asdict(archetype), "trials": trials, "loss": loss, "kept": name in self.archived}
         self._record_file.write_text(json.dumps(self.record(), indent=2) + "\n")
+        done.touch()
 
     def record(self) -> dict[str, Any]:
         """How the archive came to be; the trials are those of the last training for each of them."""

@@ -62,23 +62,27 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
 
     with monkeypatch.context() as patched:
         patched.setattr(archive_policies, "refine", lambda *_: pytest.fail("it was trained again"))
+        changed, other = (tmp_path / "refined" / f"{name}.safetensors" for name in ("level", "even"))
+        changed.write_bytes(other.read_bytes())
         assert archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW) == record
+        assert changed.read_bytes() == other.read_bytes(), "what was improved since is not taken back"
 
     even, level = ((tmp_path / "refined" / f"{name}.safetensors").read_bytes() for name in ("even", "level"))
-    (tmp_path / "work" / "level.json").unlink()
+    (tmp_path / "work" / "level-done").unlink()
     again = archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
     assert began == [0, 1, 2, 2], "whoever is refined again begins as the best of all that are there"
     assert [(each["name"], each["kept"]) for each in again["archetypes"]] == [
         (each["name"], each["kept"]) for each in record["archetypes"]
     ]
     assert (tmp_path / "refined" / "even.safetensors").read_bytes() == even
-    improved = (tmp_path / "refined" / "level.safetensors").read_bytes()
-    assert improved != level
+    file = tmp_path / "refined" / "level.safetensors"
+    assert file.read_bytes() != level
 
+    file.write_bytes(level)
     monkeypatch.setattr(archive_policies, "LARGEST_LOSS", -2.0)
-    (tmp_path / "work" / "level.json").unlink()
+    (tmp_path / "work" / "level-done").unlink()
     archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
-    assert (tmp_path / "refined" / "level.safetensors").read_bytes() == improved, "what loses the task is not archived"
+    assert file.read_bytes() == level, "what loses the task is not archived"
 
 
 @pytest.mark.parametrize("task", ARCHIVES)
