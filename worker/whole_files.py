@@ -17,3 +17,8 @@ def written_whole(path: Path) -> Iterator[Path]:
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def whole_files(folder: Path, pattern: str) -> list[Path]:
+    """What a pattern finds, in order, without the drafts that killed writers left behind."""
+    return [path for path in sorted(folder.glob(pattern)) if not path.name.startswith(".")]

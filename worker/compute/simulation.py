@@ -32,6 +32,7 @@ from worker.sim.render.scene import Scene
 from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
+from worker.whole_files import whole_files
 
 REFERENCE_COUNT = 40
 
@@ -109,7 +110,7 @@ def archive_folder(name: str) -> Path:
 @cache
 def archived_policies(name: str) -> Mapping[str, GaussianPolicy]:
     """By their names; none: the task has no archive of them."""
-    return {file.stem: GaussianPolicy.load(file) for file in sorted(archive_folder(name).glob("*.safetensors"))}
+    return {file.stem: GaussianPolicy.load(file) for file in whole_files(archive_folder(name), "*.safetensors")}
 
 
 @cache
@@ -148,7 +149,7 @@ def _lab_policy(name: str, other: str) -> ReferencePolicy:
 
 def early_policies(name: str) -> list[str]:
     """Names of the early policies that ship with a task."""
-    return sorted(path.stem for path in (checkpoint(name) / "early").glob("*.safetensors"))
+    return [path.stem for path in whole_files(checkpoint(name) / "early", "*.safetensors")]
 
 
 def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:

@@ -41,6 +41,7 @@ from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
 from worker.sim.costs import signal_weights
 from worker.tasks import registry
+from worker.whole_files import whole_files, written_whole
 
 POOL_SCENARIOS = 48
 """each in six behaviours, as in a study: what the replays begin with"""
@@ -113,7 +114,7 @@ class _Making:
         self.pairs, self.scale = self._shown()
         self.folder = simulation.archive_folder(task)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.archived = {file.stem: self._driven(file) for file in sorted(self.folder.glob("*.safetensors"))}
+        self.archived = {file.stem: self._driven(file) for file in whole_files(self.folder, "*.safetensors")}
         known = json.loads(self._record_file.read_text())["archetypes"] if self._record_file.exists() else []
         self.entries: dict[str, dict[str, Any]] = {each["name"]: each for each in known}
 
@@ -128,10 +129,12 @@ class _Making:
         loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
         if loss is not None and loss <= LARGEST_LOSS:
             file = self.folder / f"{name}.safetensors"
-            GaussianPolicy(dict(refined)).save(file)
+            with written_whole(file) as draft:
+                GaussianPolicy(dict(refined)).save(draft)
             self.archived[name] = self._driven(file)
         self.entries[name] = {**asdict(archetype), "trials": trials, "loss": loss, "kept": name in self.archived}
-        self._record_file.write_text(json.dumps(self.record(), indent=2) + "\n")
+        with written_whole(self._record_file) as draft:
+            draft.write_text(json.dumps(self.record(), indent=2) + "\n")
         done.touch()
 
     def record(self) -> dict[str, Any]:

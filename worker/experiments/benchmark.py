@@ -41,7 +41,7 @@ from worker.ml.teachers import Manner, Taste, random_taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint
-from worker.whole_files import written_whole
+from worker.whole_files import whole_files, written_whole
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -273,8 +273,8 @@ def _finished(terms: BenchmarkConfig, work: Path) -> Iterator[tuple[dict[str, An
         for task in catalogue.names()
         if (checkpoint(task) / "policy.safetensors").exists()
     }
-    for path in sorted(terms.directory(work).glob("*/*/*.npz")):
-        if path.parts[-3] not in present or path.name.startswith("."):
+    for path in whole_files(terms.directory(work), "*/*/*.npz"):
+        if path.parts[-3] not in present:
             continue
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}

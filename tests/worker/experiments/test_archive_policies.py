@@ -67,6 +67,8 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
         assert archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW) == record
         assert changed.read_bytes() == other.read_bytes(), "what was improved since is not taken back"
 
+    (tmp_path / "refined" / ".soon.1.safetensors").write_bytes(b"what a killed program left behind")
+    assert list(simulation.archived_policies.__wrapped__("feeding")) == ["even", "level"]
     even, level = ((tmp_path / "refined" / f"{name}.safetensors").read_bytes() for name in ("even", "level"))
     (tmp_path / "work" / "level-done").unlink()
     again = archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
