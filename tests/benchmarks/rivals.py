@@ -10,6 +10,7 @@ loses the present cell. Seeds are finished one by one, cheap methods first; --ta
 """
 
 import argparse
+import datetime
 import json
 import os
 import sys
@@ -130,6 +131,7 @@ def _row(cell: Cell, work: Path) -> Mapping[str, Any]:
         "successes": rivals_report.successes_text(filtered["success"]),
         "successes_reference": rivals_report.successes_text(reference["success"]),
         "code": record["code"],
+        "measured": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "notes": " ".join(record["notes"]),
     }
 

@@ -19,6 +19,7 @@ def row(method: str, gains: FloatArray, successes: FloatArray, seed: int = 0) ->
         "labels": "200",
         "environment_steps": "50000",
         "cpu_s": "60",
+        "measured": f"2026-11-2{seed}",
         "gains": rivals_report.gains_text(gains),
         "successes": rivals_report.successes_text(successes),
         "successes_reference": rivals_report.successes_text(np.ones(100)),
@@ -50,6 +51,30 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
     assert "`residual_rl` by +20.0 [+20.0, +20.0]; success -10.0 points (loses the task)." in page
     assert "| `sliders` | 1 | +5" in page
     assert "| `prefft` |" not in page.partition("## All cells together")[2].partition("## Cell by cell")[0]
+
+
+def test_seeds_together_judge_the_method_where_each_judges_its_training() -> None:
+    """Three narrow intervals, one of them ahead; over the seeds chance explains it."""
+    noise, ones = 0.001 * np.random.default_rng(0).standard_normal(100), np.ones(100)
+    rows = [
+        row(method, gain + noise, ones, seed)
+        for method, gains in {
+            "pbarl_refined": (0.10, 0.11, 0.12),
+            "dsrl": (0.13, 0.09, 0.11),
+            "sliders": (0.05,) * 3,
+        }.items()
+        for seed, gain in enumerate(gains)
+    ]
+    page = rivals_report.page([*rows, row("prefft", 0.3 + noise, ones), row("prefft", 0.3 + noise, ones, seed=1)])
+    over_seeds = page.partition("## Where a rival is not behind over seeds")[2].partition("## All cells")[0]
+    assert "* feeding, neutral, seed 0: `dsrl` by +3.0 [+3.0, +3.0]" in page
+    # Differences of 3, -2 and -1 points: mean 0, standard error 1.53, t with two degrees of freedom 4.30.
+    assert "Behind in 1 of 2 comparisons; in the others:" in over_seeds
+    assert "`dsrl` by +0.0 [-6.6, +6.6] (within); success +0.0 points in the worst of them." in over_seeds
+    assert "prefft" not in over_seeds, "two seeds say too little"
+    # The three runs: standard error .58.
+    assert "| `pbarl_refined` | +11.0 [+8.5, +13.5], 3 |" in page
+    assert "| `dsrl` | 2026-11-20 to 2026-11-22 |" in page
 
 
 def test_no_table_is_no_rows(tmp_path: Any) -> None:
