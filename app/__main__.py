@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from app import data_directory, logs, signing, upgrading
 from app.commands import audit_commands, deploy_check
+from app.commands.parsers import Commands, add_command
 from app.db import Database, now
 from app.domain.studies import Study
 from app.errors import EXPLAINED, AppError, in_words
@@ -46,21 +47,18 @@ TURN_S = 0.0005
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m app", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, act in _COMMANDS.items():
-        commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
+        add_command(commands, name, act)
     audit_commands.add_to(commands)
     deploy_check.add_to(commands)
-    demo = commands.add_parser("demo", help=demo_study.__doc__)
+    demo = add_command(commands, "demo", demo_study)
     demo.add_argument("--task", type=catalogue.as_argument, metavar="NAME", default=catalogue.usual())
-    demo.set_defaults(act=demo_study)
-    resetting = commands.add_parser("reset-second-factor", help=reset_second_factor.__doc__)
+    resetting = add_command(commands, "reset-second-factor", reset_second_factor)
     resetting.add_argument("name", help="of the account")
-    resetting.set_defaults(act=reset_second_factor)
-    importing = commands.add_parser("import-study", help=import_study.__doc__)
+    importing = add_command(commands, "import-study", import_study)
     importing.add_argument("file", type=Path, help="the archive")
     importing.add_argument("--seal-key", default="", help="of the archive of a study that is still blinded")
-    importing.set_defaults(act=import_study)
     _add_backups(commands)
     chosen = vars(parser.parse_args(arguments))
     act, _ = chosen.pop("act"), chosen.pop("command")
@@ -80,18 +78,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _add_backups(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    making = commands.add_parser("backup", help=back_up.__doc__)
+def _add_backups(commands: Commands) -> None:
+    making = add_command(commands, "backup", back_up)
     making.add_argument("target", type=Path, nargs="?", help="directory of backups; default: BACKUP_DIR")
-    making.set_defaults(act=back_up)
-    restoring = commands.add_parser("restore", help=restore.__doc__)
+    restoring = add_command(commands, "restore", restore)
     restoring.add_argument("backup", type=Path, help="the folder of one backup")
     restoring.add_argument("--into", type=Path, help="another data directory; default: DATA_DIR")
     restoring.add_argument("--replace", action="store_true", help="move aside what is there")
-    restoring.set_defaults(act=restore)
-    verifying = commands.add_parser("verify", help=verify.__doc__)
+    verifying = add_command(commands, "verify", verify)
     verifying.add_argument("backup", type=Path, help="the folder of one backup")
-    verifying.set_defaults(act=verify)
 
 
 def migrate(settings: Settings) -> int:

@@ -38,7 +38,7 @@ def run(arguments: Sequence[str] | None) -> int:
 def parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     """What can be said on the command line; where it begins with a command, that and those of the same subject."""
     whole = argparse.ArgumentParser(prog="python -m worker", description="The worker of PbARL Studio and its tools.")
-    commands = whole.add_subparsers(dest="command", required=True)
+    commands = whole.add_subparsers(dest="command", metavar="COMMAND", required=True)
     asked = MODULES.get(arguments[0]) if arguments else None
     for name in dict.fromkeys(MODULES.values()) if asked is None else [asked]:
         import_module(f"worker.commands.{name}").add(commands)

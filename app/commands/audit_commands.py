@@ -1,15 +1,14 @@
 """Commands about proof: check the audit log, show its head, receipts of erasures, the signing key and signatures."""
 
-import argparse
 import hashlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from app import signing, upgrading
+from app.commands.parsers import Commands, add_command
 from app.db import Database
 from app.errors import AppError
 from app.programs import say
@@ -29,22 +28,18 @@ class FileUnreadable(AppError):
     """This file is neither a bundle, an archive, a receipt nor a head of the audit log, or it is damaged."""
 
 
-def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_to(commands: Commands) -> None:
     """Make the commands known to the command line."""
-    simple: dict[str, Callable[..., int]] = {"audit-head": audit_head, "signing-key": signing_key}
-    for name, act in simple.items():
-        commands.add_parser(name, help=act.__doc__).set_defaults(act=act)
-    checking = commands.add_parser("verify-audit", help=verify_audit.__doc__)
+    add_command(commands, "audit-head", audit_head)
+    add_command(commands, "signing-key", signing_key)
+    checking = add_command(commands, "verify-audit", verify_audit)
     checking.add_argument("--head", default=None, metavar="HASH", help="the head as it was noted elsewhere")
     checking.add_argument("--file", type=Path, default=None, help="an export (JSONL) to check instead of the database")
-    checking.set_defaults(act=verify_audit)
-    showing = commands.add_parser("erasure-receipts", help=erasure_receipts.__doc__)
+    showing = add_command(commands, "erasure-receipts", erasure_receipts)
     showing.add_argument("number", type=int, nargs="?", help="of the receipt to print, signed")
-    showing.set_defaults(act=erasure_receipts)
-    signature = commands.add_parser("check-signature", help=check_signature.__doc__)
+    signature = add_command(commands, "check-signature", check_signature)
     signature.add_argument("file", type=Path)
     signature.add_argument("--seal-key", default="", help="of the archive of a study that is still blinded")
-    signature.set_defaults(act=check_signature)
 
 
 def audit_head(settings: Settings) -> int:

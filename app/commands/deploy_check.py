@@ -3,7 +3,6 @@
 It looks and changes nothing: neither the schema nor the permissions that other commands would close.
 """
 
-import argparse
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from sqlalchemy import func, make_url, select
 from sqlalchemy.orm import Session
 
 from app import upgrading
+from app.commands.parsers import Commands, add_command
 from app.db import Database, now, sqlite
 from app.domain.people import ApiToken, Experimenter
 from app.programs import say
@@ -43,11 +43,10 @@ class Finding:
     """False: safe in some places; whoever runs this studio decides."""
 
 
-def add_to(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_to(commands: Commands) -> None:
     """Make the command known to the command line."""
-    checking = commands.add_parser("check", help=check.__doc__)
+    checking = add_command(commands, "check", check)
     checking.add_argument("--deploy", action="store_true", help="also say what is not safe when others can reach it")
-    checking.set_defaults(act=check)
 
 
 def check(settings: Settings, deploy: bool) -> int:

@@ -123,6 +123,27 @@ def test_a_command_without_options_uses_the_usual_values(command: str, table: op
     assert {path: said[path] for path in table} == {path: config and getattr(config, path) for path in table}
 
 
+def _commands() -> "argparse._SubParsersAction[argparse.ArgumentParser]":
+    (commands,) = (each for each in cli.parser()._actions if isinstance(each, argparse._SubParsersAction))
+    return commands
+
+
+def test_commands_say_what_they_do_without_words_for_programmers() -> None:
+    commands = _commands()
+    listed = {each.dest: each.help or "" for each in commands._choices_actions}
+    assert list(listed) == list(cli.MODULES)
+    for name, summary in listed.items():
+        assert summary.endswith("."), name
+        assert not any(word in summary for word in ("``", "Raises ", "returns ")), name
+        assert commands.choices[name].description, f"{name} --help does not say what it does"
+
+
+def test_no_option_has_two_defaults() -> None:
+    told = [action.help or "" for command in _commands().choices.values() for action in command._actions]
+    assert len(told) > 50
+    assert [each for each in told if each.count("default:") > 1] == []
+
+
 @pytest.mark.parametrize(
     ("said", "labels", "milestones"),
     [

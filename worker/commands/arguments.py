@@ -1,11 +1,8 @@
 """Arguments that several commands have."""
 
 import argparse
-from typing import TypeAlias
 
 from app.installed_tasks import catalogue
-
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def add_processes(command: argparse.ArgumentParser) -> None:

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from app.commands.parsers import Commands, add_command
 from app.installed_tasks import catalogue
 from app.settings import Settings
 from worker.commands import options
-from worker.commands.arguments import Commands, add_processes
+from worker.commands.arguments import add_processes
 from worker.experiments import benchmark
 from worker.experiments.benchmark_cell import INDIRECT_USERS, OPPOSED_USERS
 from worker.jobs import experiments
@@ -40,10 +41,17 @@ _HOW: Mapping[str, int] = {
 def add(commands: Commands) -> None:
     """Add ``benchmark``."""
     usual = benchmark.Selection()
-    command = commands.add_parser("benchmark", help=benchmark.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command = add_command(commands, "benchmark", _benchmark, benchmark.__doc__)
     command.add_argument("--profile", choices=list(benchmark.PROFILES), default="full")
-    command.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(usual.methods))
-    command.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=list(usual.tasks))
+    command.add_argument(
+        "--methods",
+        nargs="+",
+        choices=list(METHODS),
+        metavar="METHOD",
+        default=list(usual.methods),
+        help=f"default: all of {', '.join(METHODS)}",
+    )
+    command.add_argument("--tasks", nargs="+", choices=catalogue.names(), metavar="NAME", default=list(usual.tasks))
     command.add_argument(
         "--users",
         nargs="+",
@@ -71,7 +79,6 @@ def add(commands: Commands) -> None:
         "--output", type=Path, help="tables; default: docs/results/all_methods, or inside the work directory if quick"
     )
     command.add_argument("--report-only", action="store_true", help="run nothing, write the tables from what there is")
-    command.set_defaults(act=_benchmark)
 
 
 def what_is_measured(words: Sequence[str]) -> list[str]:
@@ -89,6 +96,7 @@ def what_is_measured(words: Sequence[str]) -> list[str]:
 
 
 def _benchmark(said: argparse.Namespace) -> int:
+    """Compare methods in unseen scenarios, by task, user and seed; finished work is kept."""
     terms = options.filled(benchmark.PROFILES[said.profile], OF_TERMS, said)
     others = [
         *(OPPOSED_USERS.values() if said.opposed else ()),

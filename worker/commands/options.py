@@ -21,7 +21,8 @@ _Config = TypeVar("_Config")
 def add(command: argparse.ArgumentParser, table: Table, config: object, *, only_said: bool = False) -> None:
     """Add options that fill a dataclass or a model of settings; ``config`` has the defaults.
 
-    ``only_said``: what was not said is None, for a command that chooses its defaults later; the help names those here.
+    ``only_said``: what was not said is None, for a command that chooses its defaults later; the help names those here,
+    unless its words name another.
     """
     for path, (option, words) in table.items():
         *outer, name = path.split(".")
@@ -32,7 +33,8 @@ def add(command: argparse.ArgumentParser, table: Table, config: object, *, only_
         how = _how(name, get_type_hints(type(owner))[name])
         if "action" not in how:
             how["default"] = None if only_said else default
-            words = "; ".join(part for part in (words, _default_in_words(default)) if part)
+            if "default:" not in words:
+                words = "; ".join(part for part in (words, _default_in_words(default)) if part)
             how |= {} if "choices" in how else {"metavar": option.strip("-").upper().replace("-", "_")}
         command.add_argument(option, dest=path, help=words, **how)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from app.commands.parsers import Commands, add_command
 from app.db import Database
 from app.domain.choices import ClipQuality, Method, Strategy
 from app.domain.protocol import EvaluationSettings
@@ -17,7 +18,7 @@ from app.installed_tasks.by_name import usual_behaviours, usual_refinement_steps
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from worker.commands import options
-from worker.commands.arguments import Commands, add_task
+from worker.commands.arguments import add_task
 from worker.experiments.benchmark_cell import PAPER_USERS
 from worker.ml.teachers import OF_LABS, LabTaste, Manner, Taste
 from worker.rehearsal import demo_study, rehearsal
@@ -59,7 +60,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_rehearsal(commands: Commands) -> None:
-    rehearse = commands.add_parser("rehearse", help=_rehearse.__doc__)
+    rehearse = add_command(commands, "rehearse", _rehearse)
     add_task(rehearse)
     rehearse.add_argument(
         "--users",
@@ -88,16 +89,14 @@ def _add_rehearsal(commands: Commands) -> None:
     rehearse.add_argument("--pace", type=float, default=0.0, help="seconds of thought per pair")
     rehearse.add_argument("--seed", type=int, default=0)
     rehearse.add_argument("--directory", type=Path, help="keep everything here; default: a temporary directory")
-    rehearse.set_defaults(act=_rehearse)
 
 
 def _add_demo_study(commands: Commands) -> None:
-    command = commands.add_parser("demo-study", help=demo_study.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    command = add_command(commands, "demo-study", _make_demo_study, demo_study.__doc__)
     command.add_argument(
         "--output", type=Path, default=demo_archive.ARCHIVE, help="the archive; default: what is shipped"
     )
     command.add_argument("--seed", type=int, default=demo_study.SEED)
-    command.set_defaults(act=_make_demo_study)
 
 
 def _rehearse(said: argparse.Namespace) -> int:
@@ -124,6 +123,7 @@ def _rehearse(said: argparse.Namespace) -> int:
 
 
 def _make_demo_study(said: argparse.Namespace) -> int:
+    """Make the study that the studio imports at its first start, anew."""
     with tempfile.TemporaryDirectory(prefix="demo-study-") as directory:
         rehearsed = demo_study.make(said.output, Path(directory), said.seed)
     sys.stdout.write(rehearsal.summary(rehearsed) + "\n")

@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 
 from app import upgrading
+from app.commands.parsers import Commands, add_command
 from app.db import Database
 from app.settings import Settings
 from app.storage import ArtefactStore, keep_private
-from worker.commands.arguments import Commands
 from worker.jobs import service
 from worker.jobs.clips import import_clips
 from worker.jobs.clips.own_clips import Choices
@@ -16,17 +16,14 @@ from worker.jobs.clips.own_clips import Choices
 
 def add(commands: Commands) -> None:
     """Add ``run`` and ``import-clips``."""
-    serve = commands.add_parser("run", help=service.run.__doc__)
-    serve.set_defaults(act=lambda _options: service.run(Settings()))
-
-    clips = commands.add_parser("import-clips", help="make a study of your own recordings (docs/own_clips.md)")
+    add_command(commands, "run", _run)
+    clips = add_command(commands, "import-clips", _import_clips)
     clips.add_argument("path", type=Path, help="folder or zip file of your own, LeRobotDataset v3, or RoboArena dump")
     clips.add_argument("--name", help="of the study")
     clips.add_argument("--camera", help="which of several is shown")
     clips.add_argument("--episodes", type=_range, metavar="FIRST:END", help="of a LeRobotDataset, as in Python")
     clips.add_argument("--signals", type=_listed, default=(), metavar="FEATURE,...", help="what people may judge by")
     clips.add_argument("--rate", type=int, default=Choices.rate_hz, help="steps per second of a RoboArena dump")
-    clips.set_defaults(act=_import_clips)
 
 
 def _range(text: str) -> range:
@@ -38,7 +35,13 @@ def _listed(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
 
+def _run(_said: argparse.Namespace) -> int:
+    """Keep studies supplied with clips, queries, models and bundles until told to stop."""
+    return service.run(Settings())
+
+
 def _import_clips(said: argparse.Namespace) -> int:
+    """Make a study of your own recordings (docs/own_clips.md)."""
     settings = Settings()
     keep_private(settings)
     upgrading.upgrade(settings)

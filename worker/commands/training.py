@@ -5,8 +5,9 @@ import json
 import sys
 from pathlib import Path
 
+from app.commands.parsers import Commands, add_command
 from app.settings import Settings
-from worker.commands.arguments import Commands, add_processes, add_task
+from worker.commands.arguments import add_processes, add_task
 from worker.experiments import (
     archive_modes,
     archive_policies,
@@ -21,48 +22,45 @@ from worker.tasks.registry import NotExplored, checkpoint
 
 def add(commands: Commands) -> None:
     """Add ``pretrain``, ``explore``, ``archive``, ``archive-policies`` and ``foresee``."""
-    pretrain = commands.add_parser("pretrain", help=pretrain_policy.pretrain.__doc__)
+    pretrain = add_command(commands, "pretrain", _pretrain)
     add_task(pretrain)
     pretrain.add_argument("--seed", type=int, default=0)
     pretrain.add_argument("--directory", type=Path, help="where the policy goes; default: where the studio keeps it")
-    pretrain.set_defaults(act=_pretrain)
 
-    explore = commands.add_parser("explore", help=fit_response_surface.explore.__doc__)
+    explore = add_command(commands, "explore", _explore)
     add_task(explore)
     explore.add_argument("--work-directory", type=Path, help="finished blocks; default: explore/ in the data directory")
     explore.add_argument("--scenarios", type=int, default=fit_response_surface.SCENARIOS, help="each in twelve modes")
     explore.add_argument("--sought", type=int, help="scenarios of every later round; default: a fifth of the first's")
     add_processes(explore)
-    explore.set_defaults(act=_explore)
 
-    archive = commands.add_parser("archive", help=archive_modes.archive.__doc__)
+    archive = add_command(commands, "archive", _archive)
     add_task(archive)
     archive.add_argument("--work-directory", type=Path, help="finished blocks; default: archive/ in the data directory")
     add_processes(archive)
-    archive.set_defaults(act=_archive)
 
-    policies = commands.add_parser("archive-policies", help=archive_policies.archive_policies.__doc__)
+    policies = add_command(commands, "archive-policies", _archive_policies)
     add_task(policies)
     policies.add_argument(
         "--work-directory", type=Path, help="finished policies; default: archive-policies/ in the data directory"
     )
-    policies.set_defaults(act=_archive_policies)
 
-    foresee = commands.add_parser("foresee", help=train_signal_predictor.foresee.__doc__)
+    foresee = add_command(commands, "foresee", _foresee)
     add_task(foresee)
     foresee.add_argument("--work-directory", type=Path, help="rollouts; default: foresight/ in the data directory")
     foresee.add_argument(
         "--scenarios", type=int, default=train_signal_predictor.SCENARIOS, help="each in six behaviours"
     )
     add_processes(foresee)
-    foresee.set_defaults(act=_foresee)
 
 
 def _pretrain(said: argparse.Namespace) -> int:
+    """Train a task's reference policy by SAC, or go on with a training that was interrupted (ten to twenty minutes)."""
     return pretrain_policy.pretrain(said.task, said.seed, said.directory or checkpoint(said.task))
 
 
 def _explore(said: argparse.Namespace) -> int:
+    """Drive a task in many modes and fit its response surface, from which filters are found; finished work is kept."""
     work = said.work_directory or Settings().data_dir / "explore" / said.task
     try:
         record = fit_response_surface.explore(said.task, work, said.processes, said.scenarios, said.sought)
@@ -74,6 +72,7 @@ def _explore(said: argparse.Namespace) -> int:
 
 
 def _archive(said: argparse.Namespace) -> int:
+    """Search modes for many people beforehand and write them into a task's response surface; finished work is kept."""
     work = said.work_directory or Settings().data_dir / "archive" / said.task
     try:
         record = archive_modes.archive(said.task, work, said.processes)
@@ -85,6 +84,7 @@ def _archive(said: argparse.Namespace) -> int:
 
 
 def _archive_policies(said: argparse.Namespace) -> int:
+    """Refine policies beforehand, from which refinements begin; six to twenty minutes each, finished ones are kept."""
     work = said.work_directory or Settings().data_dir / "archive-policies" / said.task
     try:
         record = archive_policies.archive_policies(said.task, work)
@@ -96,6 +96,7 @@ def _archive_policies(said: argparse.Namespace) -> int:
 
 
 def _foresee(said: argparse.Namespace) -> int:
+    """Train what foresees a task's signals from state and action, for who learns without measured signals."""
     record = train_signal_predictor.foresee(
         said.task,
         said.work_directory or Settings().data_dir / "foresight",
