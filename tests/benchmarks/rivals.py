@@ -10,11 +10,11 @@ loses the present cell. Seeds are finished one by one, cheap methods first; --ta
 """
 
 import argparse
-import datetime
 import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ def _row(cell: Cell, work: Path) -> Mapping[str, Any]:
         "successes": rivals_report.successes_text(filtered["success"]),
         "successes_reference": rivals_report.successes_text(reference["success"]),
         "code": record["code"],
-        "measured": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "measured": datetime.fromtimestamp(cell.path(TERMS, work).stat().st_mtime, UTC).date().isoformat(),
         "notes": " ".join(record["notes"]),
     }
 
