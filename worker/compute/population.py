@@ -6,24 +6,26 @@ from functools import cache
 import numpy as np
 
 from worker.domain.type_aliases import FloatArray
-from worker.ml.rewards.prior import EARLIER, SCRIPTED, Prior, standardised_weights
+from worker.ml.rewards.prior import DECIDED, EARLIER, SCRIPTED, Prior, standardised_weights
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.teachers import random_taste
 from worker.sim.costs import signal_weights
 from worker.tasks import registry
 
 PEOPLE = 400
-DECIDEDNESS = 10.0
-"""Norm of a scripted person's weights, log odds per standard deviation of a pair: how sure their answers are."""
 
 
 def prior_of(task: str | None, spread: FloatArray, earlier: Sequence[RewardModel] = ()) -> Prior:
-    """Somebody is like the scripted population of the task, like those whose ``earlier`` models are given, or like
-    nobody known. ``spread`` (S,) as in SignalScale; None: no task of ours, whose signals we know nothing about."""
+    """Somebody is like the scripted population of the task, hardly minds or likes anything but one signal, is like
+    those whose ``earlier`` models are given, or like nobody known.
+
+    ``spread`` (S,) as in SignalScale; None: no task of ours, whose signals we know nothing about.
+    """
     prior = Prior.standard(len(spread))
     if task is not None and not registry.task(task).is_a_labs:
         wants = scripted_weights(task) * spread
-        prior = prior.or_like(SCRIPTED, DECIDEDNESS * wants / np.linalg.norm(wants, axis=1, keepdims=True))
+        decided = DECIDED * wants / np.linalg.norm(wants, axis=1, keepdims=True)
+        prior = prior.or_like(SCRIPTED, decided).or_for_whom_one_matters()
     return prior.or_like(EARLIER, standardised_weights(earlier, spread))
 
 

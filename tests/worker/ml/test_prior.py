@@ -6,7 +6,7 @@ import pytest
 from tests.worker import invented
 from worker.compute.population import prior_of, scripted_weights
 from worker.domain.trajectory import SIGNALS
-from worker.ml.rewards.prior import Population, Prior, standardised_weights
+from worker.ml.rewards.prior import ONE_MATTERS, Population, Prior, standardised_weights
 from worker.ml.rewards.reward_models import NEVER_WANTED, StructuredReward
 from worker.ml.rewards.reward_training import fit, posterior
 from worker.ml.rewards.signal_scale import SignalScale
@@ -56,6 +56,36 @@ def test_who_is_not_like_the_others_is_heard_as_if_nobody_was_known() -> None:
     alone, known = posterior(features, answers), posterior(features, answers, KNOWN)
     assert known.shares[1] < 0.01
     np.testing.assert_allclose(known.mean, alone.mean, atol=0.2)
+
+
+def test_without_an_answer_every_name_is_as_likely_however_many_populations_have_it() -> None:
+    prior = KNOWN.or_for_whom_one_matters()
+    found = posterior(np.zeros((0, 4)), np.zeros(0), prior)
+    names = {"nobody known": 1 / 3, "people": 1 / 3, ONE_MATTERS: 1 / 3}
+    assert prior.by_name(found.shares) == pytest.approx(names)
+    np.testing.assert_allclose(found.shares[2:], 1 / 12)
+    np.testing.assert_allclose(found.mean, KNOWN.populations[1].mean / 3)
+
+
+@pytest.mark.parametrize("wish", [8.0, -8.0])
+@pytest.mark.parametrize("column", range(4))
+def test_who_cares_for_one_thing_is_known_after_twenty_answers(column: int, wish: float) -> None:
+    weights = np.zeros(4)
+    weights[column] = wish
+    features, answers = answers_of(weights, 20)
+    prior = KNOWN.or_for_whom_one_matters()
+    found = posterior(features, answers, prior)
+    assert prior.by_name(found.shares)[ONE_MATTERS] > 0.8
+    assert int(found.shares.argmax()) == 2 + column
+    others = np.delete(np.abs(found.mean), column)
+    assert others.max() < 0.1 * abs(found.mean[column])
+    assert others.max() < 0.5 * np.delete(np.abs(posterior(features, answers, KNOWN).mean), column).max()
+
+
+def test_who_cares_for_many_things_is_not_taken_for_somebody_who_cares_for_one() -> None:
+    prior = KNOWN.or_for_whom_one_matters()
+    found = posterior(*answers_of(np.array([-3.0, 3.0, 3.0, -3.0]), 20), prior)
+    assert prior.by_name(found.shares)[ONE_MATTERS] < 0.05
 
 
 def test_earlier_models_give_their_weights_in_the_unit_of_the_fit() -> None:

@@ -5,6 +5,7 @@ the answers themselves say which of them somebody is of (reward_training.posteri
 is right and is soon out of the way where it is not: nobody is pulled towards people whom their answers contradict.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -18,7 +19,11 @@ from worker.ml.rewards.reward_models import RewardModel, StructuredReward
 DEVIATION = 4.0
 """Of every weight of somebody who is like nobody known: wide, because a narrow prior spreads what is wanted over all
 signals that go along with it (docs/results/chosen_modes.md)."""
+INDIFFERENT, DECIDED = 0.5, 10.0
+"""Deviations of the weights of somebody to whom one signal matters: of all others, and of that one, which decides as
+much as all weights of a scripted person together. What was tried: docs/results/few_answers.md."""
 NOBODY_KNOWN, SCRIPTED, EARLIER = "nobody known", "scripted people", "earlier participants"
+ONE_MATTERS = "people to whom one thing matters"
 """What populations are called."""
 FEWEST_PEOPLE = 3
 """Fewer are no population."""
@@ -49,6 +54,13 @@ class Population:
         shrunk = SHARED * covariance + OWN * np.diag(np.diag(covariance))
         return cls(name, weights.mean(axis=0), shrunk + FLOOR * cls.anybody(weights.shape[-1]).covariance)
 
+    @classmethod
+    def for_whom_matters(cls, column: int, size: int) -> Self:
+        """N(0, INDIFFERENT^2) but for one signal, which is wanted or minded, N(0, DECIDED^2)."""
+        deviations = np.full(size, INDIFFERENT)
+        deviations[column] = DECIDED
+        return cls(ONE_MATTERS, np.zeros(size), np.diag(deviations**2))
+
     def with_further(self, count: int, deviation: float) -> Self:
         """See Prior."""
         size = len(self.mean)
@@ -59,9 +71,25 @@ class Population:
 
 @dataclass(frozen=True)
 class Prior:
-    """The populations that somebody may be of, each as likely as the others; the first is anybody()."""
+    """The populations that somebody may be of; the first is anybody().
+
+    Every name is as likely as the others, and so is every population among those of one name.
+    """
 
     populations: tuple[Population, ...]
+
+    @property
+    def log_chances(self) -> FloatArray:
+        """(P,) of each population before the first answer, up to a constant."""
+        alike = Counter(each.name for each in self.populations)
+        return -np.log([alike[each.name] for each in self.populations])
+
+    def by_name(self, shares: FloatArray) -> dict[str, float]:
+        """Of (P,) chances of populations the sum for each name."""
+        sums = dict.fromkeys((each.name for each in self.populations), 0.0)
+        for each, share in zip(self.populations, shares, strict=True):
+            sums[each.name] += float(share)
+        return sums
 
     @classmethod
     def standard(cls, size: int) -> Self:
@@ -71,6 +99,11 @@ class Prior:
     def with_further(self, count: int, deviation: float) -> "Prior":
         """With so many more weights of which nobody knows more than N(0, deviation^2)."""
         return Prior(tuple(each.with_further(count, deviation) for each in self.populations))
+
+    def or_for_whom_one_matters(self) -> "Prior":
+        """Or somebody to whom hardly anything matters but one signal, whichever it is."""
+        size = len(self.populations[0].mean)
+        return Prior((*self.populations, *(Population.for_whom_matters(each, size) for each in range(size))))
 
     def or_like(self, name: str, weights: npt.ArrayLike) -> "Prior":
         """Or like P people with these weights, (P, S); too few are left out."""

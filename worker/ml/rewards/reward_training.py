@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
 from scipy.special import softmax
 
 from worker.domain.trajectory import SIGNALS, Trajectory
@@ -16,8 +15,8 @@ from worker.ml.rewards import calibration
 from worker.ml.rewards.beyond_sums.changing import ChangingWeights
 from worker.ml.rewards.beyond_sums.misfit import RICHER_DEVIATION
 from worker.ml.rewards.beyond_sums.terms import FurtherTerms
-from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 from worker.ml.rewards.calibration import HeldOut
+from worker.ml.rewards.laplace import Laplace, laplace
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining, fit_mlp, fit_transformer
 from worker.ml.rewards.predicted_reward import PredictedReward
 from worker.ml.rewards.prior import Population, Prior
@@ -29,8 +28,6 @@ from worker.ml.rewards.signal_scale import SignalScale
 RewardKind = Literal["structured", "predicted", "mlp", "preference_transformer"]
 
 MEMBERS = 8
-LARGEST_GRADIENT = 1e-6
-"""At what counts as the posterior's mode."""
 CALIBRATION_FOLDS = 5
 HINT_STRENGTH = 1.0
 """Standard deviations of a pair by which the clips of a hint differ (docs/results/hints.md)."""
@@ -211,7 +208,7 @@ def _fit_structured(
     return StructuredReward(members, least_per_step=scale.least_per_step, most_per_step=scale.most_per_step), {
         "weights": weights,
         "weights_unit": "log odds per standard deviation of a pair",
-        "population_shares": {each.name: float(share) for each, share in zip(prior.populations, shares, strict=True)},
+        "population_shares": prior.by_name(shares),
         "held_out": _held_out(features, answers, extra, seed, prior, costs),
     }
 
@@ -258,74 +255,26 @@ def posterior(
     """
     known = prior or Prior.standard(features.shape[1])
     found = [_in_population(features, answers, each, costs) for each in known.populations]
-    shares = softmax([each.evidence for each in found])
+    shares = softmax([each.evidence for each in found] + known.log_chances)
     mean = shares @ np.array([each.mean for each in found])
     apart = np.array([each.mean for each in found]) - mean
-    within = np.tensordot(shares, np.array([each.covariance for each in found]), 1)
+    within = np.tensordot(shares, np.linalg.inv([each.information for each in found]), 1)
     return Posterior(mean, within + (apart.T * shares) @ apart, shares)
 
 
-class _Laplace(NamedTuple):
-    mean: FloatArray
-    covariance: FloatArray
-    evidence: float
-    """log p(labels | population), but for a constant"""
-
-
-def _in_population(features: FloatArray, answers: FloatArray, population: Population, costs: Sequence[int]) -> _Laplace:
+def _in_population(features: FloatArray, answers: FloatArray, population: Population, costs: Sequence[int]) -> Laplace:
     pinned: set[int] = set()
     while True:
-        found = _laplace(features, answers, population, sorted(pinned))
-        wrong = {column for column in costs if found.mean[column] > 0.0} - pinned
+        held = sorted(pinned)
+        mean, precision = population.mean.copy(), np.array(np.linalg.inv(population.covariance), np.float64)
+        mean[held] = 0.0
+        precision[held, held] += _PINNED
+        found = laplace(features, answers, mean, precision)
+        found.mean[held] = 0.0
+        wrong = {column for column in costs if found.mean[column] > 0.0}
         if not wrong:
             return found
         pinned |= wrong
-
-
-def _laplace(features: FloatArray, answers: FloatArray, population: Population, pinned: Sequence[int]) -> _Laplace:
-    """The mode by a trust region, which overshoots neither on separable data nor where somebody may have slipped."""
-    precision, mean = np.asarray(np.linalg.inv(population.covariance), np.float64), population.mean.copy()
-    precision[pinned, pinned] += _PINNED
-    mean[pinned] = 0.0
-
-    def loss(weights: FloatArray) -> tuple[float, FloatArray]:
-        said = probability_of_answer(probability_right(features @ weights))
-        surprise = -(answers * np.log(said) + (1.0 - answers) * np.log(1.0 - said)).sum()
-        pull = precision @ (weights - mean)
-        gradient = _gradient_and_information(features, answers, weights)[0]
-        return float(surprise + 0.5 * pull @ (weights - mean)), gradient + pull
-
-    def curvature(weights: FloatArray) -> FloatArray:
-        return _curvature(features, answers, weights) + precision
-
-    found = minimize(loss, mean, jac=True, hess=curvature, method="trust-exact", options={"gtol": LARGEST_GRADIENT})
-    weights: FloatArray = found.x
-    weights[pinned] = 0.0
-    information = _gradient_and_information(features, answers, weights)[1] + precision
-    narrowed = np.linalg.slogdet(precision)[1] - np.linalg.slogdet(information)[1]
-    return _Laplace(weights, np.asarray(np.linalg.inv(information), np.float64), float(0.5 * narrowed - found.fun))
-
-
-def _gradient_and_information(
-    features: FloatArray, answers: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Of the summed right form of Eq. (2) for people who sometimes answer at random: (S,) and Fisher's (S, S)."""
-    preferred = probability_right(features @ weights)
-    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
-    variance = said * (1.0 - said)
-    gradient: FloatArray = features.T @ ((said - answers) * slope / variance)
-    information: FloatArray = features.T @ (features * (slope**2 / variance)[:, None])
-    return gradient, information
-
-
-def _curvature(features: FloatArray, answers: FloatArray, weights: FloatArray) -> FloatArray:
-    """(S, S) second derivative of what _gradient_and_information() is of: a third of the steps that Fisher's takes."""
-    preferred = probability_right(features @ weights)
-    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
-    variance = said * (1.0 - said)
-    off = slope * (1.0 - 2.0 * preferred) / variance - (1.0 - 2.0 * said) * (slope / variance) ** 2
-    curvature: FloatArray = features.T @ (features * (slope**2 / variance + (said - answers) * off)[:, None])
-    return curvature
 
 
 def antithetic(mean: FloatArray, covariance: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -16,8 +16,7 @@ import numpy as np
 from worker.domain.spaces import Space
 from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.beyond_sums import explanations
-from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
-from worker.ml.rewards.calibration import cross_entropy
+from worker.ml.rewards.laplace import laplace
 from worker.ml.rewards.prior import DEVIATION
 from worker.ml.rewards.segments import SegmentPairs
 from worker.ml.rewards.signal_scale import SignalScale
@@ -30,9 +29,6 @@ RICHER_DEVIATION = 1.0
 of what is very clear, and errs more often (docs/results/misfit.md)."""
 CHANGING = "changing"
 """The richer model whose weights move along with the number of the answer."""
-MOST_STEPS = 100
-SMALLEST_GAIN = 1e-6
-"""Of log probability, that is still a step worth making."""
 _SPEED, _NEAR_SPEED = "speed_squared_m2_s2", "near_speed_squared_m2_s2"
 _SCENE = ("target_outward", "tool_to_target_m")
 _SMALLEST_SPREAD = 1e-6
@@ -87,35 +83,8 @@ def log_ratios(sums: FloatArray, further: Mapping[str, FloatArray], answers: Flo
 
 
 def log_likelihood(features: FloatArray, answers: FloatArray, deviations: FloatArray) -> float:
-    """log p(answers) under weights of N(0, deviations^2), by Laplace's approximation at their most probable values.
-
-    Found by Fisher scoring with halved steps: a tenth of the time of reward_training.posterior(), which also holds
-    weights of costs at 0, and is made once an answer where this is made six times.
-    """
-    precision = deviations**-2.0
-    weights = np.zeros(len(precision))
-    loss, gradient, curvature = _loss(features, answers, weights, precision)
-    for _ in range(MOST_STEPS):
-        step = np.linalg.solve(curvature, gradient)
-        if step @ gradient < SMALLEST_GAIN:
-            break
-        while (found := _loss(features, answers, weights - step, precision))[0] > loss:
-            step = step / 2
-        weights, (loss, gradient, curvature) = weights - step, found
-    room = np.log(precision).sum() - np.linalg.slogdet(curvature)[1]
-    return float(0.5 * room - loss)
-
-
-def _loss(
-    features: FloatArray, answers: FloatArray, weights: FloatArray, precision: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Minus the log of the answers' and the weights' probability up to a constant, its gradient, Fisher's matrix."""
-    preferred = probability_right(features @ weights)
-    said, slope = probability_of_answer(preferred), slope_of_answer(preferred)
-    variance = said * (1.0 - said)
-    surprise = cross_entropy(said, answers) * len(answers) + 0.5 * float(precision @ weights**2)
-    gradient = features.T @ ((said - answers) * slope / variance) + precision * weights
-    return surprise, gradient, features.T @ (features * (slope**2 / variance)[:, None]) + np.diag(precision)
+    """log p(answers) under weights of N(0, deviations^2), deviations (S,), by Laplace's approximation."""
+    return laplace(features, answers, np.zeros(len(deviations)), np.diag(deviations**-2.0)).evidence
 
 
 def scene_of(observation: Space) -> list[int]:
