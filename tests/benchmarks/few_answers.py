@@ -4,8 +4,9 @@
 
 Scripted users (5 % mistakes, 10 % "equal") answer pairs of a pool as large as a study's, chosen by entropy, 30 % at
 random, a model every ten answers, every twenty from 100 on. "before" is what was done until decision 135: nobody is
-known, and a mode's return counts less by the deviation of the model's members. "pooled": twelve earlier people of the
-population are known as well; before, they were the whole prior. The search picks the user's mode without trials; its
+known, and a mode's return counts less by the deviation of the model's members. "now, but for one thing": the prior of
+decision 135, without people to whom one thing matters. "pooled": twelve earlier people of the population are known as
+well; before, they were the whole prior. The search picks the user's mode without trials; its
 gain of the true preference, in % of what the user minds and likes under the reference policy, is what the response
 surface predicts. Models are posteriors without the temperature of their probabilities, which hardly matters to what is
 asked. Every finished chain is kept in --output: repeat the command to go on.
@@ -37,7 +38,7 @@ from worker.ml import acquisition
 from worker.ml.filters.fitting.mode_worth import price_of_failures
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
 from worker.ml.rewards.bradley_terry import probability_right
-from worker.ml.rewards.prior import Population, Prior
+from worker.ml.rewards.prior import ONE_MATTERS, Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED
 from worker.ml.rewards.reward_training import antithetic, posterior
 from worker.ml.stopping import relative_regret
@@ -52,7 +53,8 @@ CHOOSE_AT = (*range(10, 101, 10), 25, *range(120, 201, 20))
 EARLIER = range(900, 912)
 FIRST = 500
 """of the numbers of people whom no choice was made by"""
-VARIANTS = {"before": COUNTS, "now": COUNTS, "before, pooled": FEW, "now, pooled": FEW}
+WITHOUT = "now, but for one thing"
+VARIANTS = {"before": COUNTS, "now": COUNTS, WITHOUT: COUNTS[:-1], "before, pooled": FEW, "now, pooled": FEW}
 COSTS = [column for column, name in enumerate(SIGNALS) if name in NEVER_WANTED]
 GROUPS = ("named", "drawn", "outside")
 WORTHWHILE = (3.0, 60.0)
@@ -175,6 +177,7 @@ class FewAnswers(Bench):
         return {
             "before": nobody,
             "now": self.prior,
+            WITHOUT: Prior(tuple(each for each in self.prior.populations if each.name != ONE_MATTERS)),
             "before, pooled": Prior((Population.of("earlier", np.array(earlier)),)),
             "now, pooled": self.prior.or_like("earlier", known),
         }
@@ -284,7 +287,13 @@ def main() -> None:
             page,
             TITLE,
             "\n\n".join(
-                [table_of_gains(rows), table_of_pooling(benches, rows), table_of_advice(rows), table_of_lengths(rows)]
+                [
+                    table_of_gains(rows),
+                    table_of_one_thing(rows),
+                    table_of_pooling(benches, rows),
+                    table_of_advice(rows),
+                    table_of_lengths(rows),
+                ]
             ),
         )
     )
@@ -344,6 +353,24 @@ def table_of_gains(rows: Sequence[Row]) -> str:
             for now, before in ((25, 100), (50, 200), (100, 100), (200, 200))
         ]
         lines.append(f"| {task.capitalize()} | {group} | {best:.1f} | " + " | ".join([*means, *compared]) + " |")
+    return "\n".join(lines)
+
+
+def table_of_one_thing(rows: Sequence[Row]) -> str:
+    """What it is worth that the prior knows people to whom one thing matters; intervals by Student's t over users."""
+    counts = VARIANTS[WITHOUT]
+    lines = [
+        "| task | people | more by the prior with people to whom one thing matters, points: "
+        + " | ".join(str(count) for count in counts)
+        + " |",
+        "|---|---|" + "---|" * len(counts),
+    ]
+    for task, group in product(catalogue.names(), GROUPS):
+        more = [
+            _interval(_by_user(rows, task, group, "now", count) - _by_user(rows, task, group, WITHOUT, count))
+            for count in counts
+        ]
+        lines.append(f"| {task.capitalize()} | {group} | " + " | ".join(more) + " |")
     return "\n".join(lines)
 
 
