@@ -57,7 +57,7 @@ class StudySettings(BaseModel):
         100,
         Section.START,
         "Answers per participant",
-        "The paper used 200. Of 180 scripted people 3 gain much by a second hundred, and 20 by going on from 50.",
+        "The paper used 200. Of 180 scripted people 3 gain much by a second hundred, and 18 by going on from 50.",
         unit="pairs",
         fixed_by=Use.PAIRS,
         ge=10,

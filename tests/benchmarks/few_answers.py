@@ -105,6 +105,7 @@ class FewAnswers(Bench):
 
     def __init__(self, name: str, pools: Path, people: int) -> None:
         super().__init__(name, pools, {"": Variant()})
+        self._known_wishes = dict[str, Wish]()
         self.features = self.segments(self.pairs).signal_differences() / self.scale.spread
         self.tastes: dict[str, dict[str, Taste]] = {
             "named": dict(TASTES),
@@ -159,7 +160,12 @@ class FewAnswers(Bench):
         return free[acquisition.choose(count, len(free), rng, rule="entropy", scores=scores).indices]
 
     def wish(self, taste: Taste) -> Wish:
-        """See Wish."""
+        """See Wish; the search for the best mode takes a second."""
+        if taste.name not in self._known_wishes:
+            self._known_wishes[taste.name] = self._wish(taste)
+        return self._known_wishes[taste.name]
+
+    def _wish(self, taste: Taste) -> Wish:
         wish = Wish(signal_weights(self.task, taste.omega, taste.per_signal), stake(self.task, taste) / 100, 0.0)
         return wish._replace(best=wish.gain(self.surface, best_mode(self.surface, wish.weights, 0)))
 
@@ -194,7 +200,7 @@ class FewAnswers(Bench):
     def _outsider(self, number: int) -> Taste:
         """Somebody whom the population does not have, and for whom something is to be gained."""
         drawn = (self._drawn_outside(number, np.random.default_rng([number, attempt, 77])) for attempt in range(1000))
-        return next(each for each in drawn if WORTHWHILE[0] <= self.wish(each).best <= WORTHWHILE[1])
+        return next(each for each in drawn if WORTHWHILE[0] <= self._wish(each).best <= WORTHWHILE[1])
 
     def _drawn_outside(self, number: int, rng: np.random.Generator) -> Taste:
         """By turns: two signals minded instead of liked or the reverse, each as much as all else together where nobody
