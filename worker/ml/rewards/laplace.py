@@ -1,6 +1,7 @@
 """Bayesian logistic regression: what answers say about weights under a Gaussian prior, by Laplace's approximation.
 
-The likelihood is Bradley and Terry's with lapses (bradley_terry.py), summed over pairs as in Eq. (2).
+The likelihood is Bradley and Terry's with lapses (bradley_terry.py), summed over pairs as in Eq. (2); the evidence is
+that of MacKay, "The evidence framework applied to classification networks" (1992).
 """
 
 from typing import NamedTuple

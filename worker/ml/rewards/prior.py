@@ -21,7 +21,7 @@ DEVIATION = 4.0
 signals that go along with it (docs/results/chosen_modes.md)."""
 INDIFFERENT, DECIDED = 0.5, 10.0
 """Deviations of the weights of somebody to whom one signal matters: of all others, and of that one, which decides as
-much as all weights of a scripted person together. What was tried: docs/results/few_answers.md."""
+much as all weights of a scripted person together. What else was tried: docs/decisions.md, 195."""
 NOBODY_KNOWN, SCRIPTED, EARLIER = "nobody known", "scripted people", "earlier participants"
 ONE_MATTERS = "people to whom one thing matters"
 """What populations are called."""
