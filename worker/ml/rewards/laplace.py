@@ -12,7 +12,7 @@ from worker.domain.type_aliases import FloatArray
 from worker.ml.rewards.bradley_terry import probability_of_answer, probability_right, slope_of_answer
 
 MOST_STEPS = 200
-SMALLEST_GAIN = 1e-10
+SMALLEST_GAIN = 1e-14
 """Of log probability, that is still a step worth making."""
 
 
