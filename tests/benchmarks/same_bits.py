@@ -54,7 +54,7 @@ FILTER = FilterConfig(
     value_steps=50,
     adapter_steps=20,
 )
-FINE_TUNING = FineTuning(steps=400, warm_up_steps=200, critic_first_updates=20, cloning_steps=50)
+FINE_TUNING = FineTuning(steps=800, warm_up_steps=200, critic_first_updates=20, cloning_steps=50)
 REFINEMENT = Refinement(
     steps=400, warm_up_steps=200, imitation_steps=50, critic_first_updates=20, critic_again_updates=10
 )
