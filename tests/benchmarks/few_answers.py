@@ -21,16 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import stats
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from app.services.answers import stopping_advice
-from tests.benchmarks import answering
+from tests.benchmarks import answering, few_answers_report
 from tests.benchmarks.answering import Bench, Variant
 from tests.benchmarks.chosen_modes import stake
+from tests.benchmarks.few_answers_report import GROUPS, TITLE, VARIANTS, WITHOUT, Row
 from worker.analysis.comparison import result_pages
-from worker.analysis.wilson import wilson_interval
 from worker.domain.responses import TARGETS
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
@@ -45,41 +44,13 @@ from worker.ml.stopping import relative_regret
 from worker.ml.teachers import TASTES, Manner, ScriptedTeacher, Taste
 from worker.sim.costs import preference_rewards, signal_weights
 
-TITLE = "# What 25 answers lead to"
-COUNTS = (25, 50, 100, 200)
-FEW = (25,)
-"""of the variants that know earlier people"""
 CHOOSE_AT = (*range(10, 101, 10), 25, *range(120, 201, 20))
 EARLIER = range(900, 912)
 FIRST = 500
 """of the numbers of people whom no choice was made by"""
-WITHOUT = "now, but for one thing"
-VARIANTS = {"before": COUNTS, "now": COUNTS, WITHOUT: COUNTS[:-1], "before, pooled": FEW, "now, pooled": FEW}
 COSTS = [column for column, name in enumerate(SIGNALS) if name in NEVER_WANTED]
-GROUPS = ("named", "drawn", "outside")
 WORTHWHILE = (3.0, 60.0)
 """% of the stake that the best mode gains. Others outside the population are drawn again"""
-
-
-class Row(NamedTuple):
-    """One user after so many answers."""
-
-    task: str
-    group: str
-    user: str
-    seed: int
-    variant: str
-    labels: int
-    gain_percent: float
-    best_percent: float
-    success_points: float
-    like_nobody_known: float
-    """how likely it is that the user is of none of the prior's populations"""
-    told_after: int
-    """answers after which it was said that more hardly pay; 0: not yet, or not looked at"""
-    told_gain: float
-    """gain_percent of the mode at that time"""
-    mode: str
 
 
 Chain = tuple[str, str, str, int, str]
@@ -292,15 +263,7 @@ def main() -> None:
         result_pages.page(
             page,
             TITLE,
-            "\n\n".join(
-                [
-                    table_of_gains(rows),
-                    table_of_one_thing(rows),
-                    table_of_pooling(benches, rows),
-                    table_of_advice(rows),
-                    table_of_lengths(rows),
-                ]
-            ),
+            few_answers_report.page(rows, lambda task, some: advantages(benches[task], some)),
         )
     )
 
@@ -325,111 +288,7 @@ def finished(file: Path) -> dict[Chain, list[Row]]:
     return {chain: rows for chain, rows in found.items() if len(rows) == len(VARIANTS[chain[4]])}
 
 
-def _by_user(rows: Sequence[Row], task: str, group: str, variant: str, labels: int) -> FloatArray:
-    """(U,) gains, the mean over seeds."""
-    gains: dict[str, list[float]] = {}
-    for row in rows:
-        if (row.task, row.group, row.variant, row.labels) == (task, group, variant, labels):
-            gains.setdefault(row.user, []).append(row.gain_percent)
-    return np.array([np.mean(each) for each in gains.values()])
-
-
-def _interval(differences: FloatArray) -> str:
-    middle = float(differences.mean())
-    half = float(stats.t.ppf(0.975, len(differences) - 1) * differences.std(ddof=1) / np.sqrt(len(differences)))
-    return f"{middle:+.1f} [{middle - half:+.1f}, {middle + half:+.1f}]"
-
-
-def table_of_gains(rows: Sequence[Row]) -> str:
-    """Now against before with four times and with as many answers; intervals by Student's t over users."""
-    lines = [
-        "| task | people | best, % | before: 25 | 50 | 100 | 200 | now: 25 | 50 | 100 | 200 "
-        "| now 25 - before 100 | now 50 - before 200 | both at 100 | both at 200 |",
-        "|" + "---|" * 15,
-    ]
-    for task, group in product(catalogue.names(), GROUPS):
-        gains = {
-            (variant, count): _by_user(rows, task, group, variant, count)
-            for variant, count in product(("before", "now"), COUNTS)
-        }
-        best = np.mean([row.best_percent for row in rows if (row.task, row.group) == (task, group)])
-        means = [f"{gains[variant, count].mean():.1f}" for variant in ("before", "now") for count in COUNTS]
-        compared = [
-            _interval(gains["now", now] - gains["before", before])
-            for now, before in ((25, 100), (50, 200), (100, 100), (200, 200))
-        ]
-        lines.append(f"| {task.capitalize()} | {group} | {best:.1f} | " + " | ".join([*means, *compared]) + " |")
-    return "\n".join(lines)
-
-
-def table_of_one_thing(rows: Sequence[Row]) -> str:
-    """What it is worth that the prior knows people to whom one thing matters; intervals by Student's t over users."""
-    counts = VARIANTS[WITHOUT]
-    lines = [
-        "| task | people | more by the prior with people to whom one thing matters, points: "
-        + " | ".join(str(count) for count in counts)
-        + " |",
-        "|---|---|" + "---|" * len(counts),
-    ]
-    for task, group in product(catalogue.names(), GROUPS):
-        more = [
-            _interval(_by_user(rows, task, group, "now", count) - _by_user(rows, task, group, WITHOUT, count))
-            for count in counts
-        ]
-        lines.append(f"| {task.capitalize()} | {group} | " + " | ".join(more) + " |")
-    return "\n".join(lines)
-
-
-def table_of_pooling(benches: Mapping[str, FewAnswers], rows: Sequence[Row]) -> str:
-    """Whether people with earlier people behind them end up with each other's robots: threes of each group."""
-    lines = [
-        "| people | answers | prior | gained, % | own mode best | own beyond the better of the others' |",
-        "|---|---|---|---|---|---|",
-    ]
-    for group, count, variant in product(GROUPS, FEW, VARIANTS):
-        chosen = [row for row in rows if (row.group, row.labels, row.variant, row.seed) == (group, count, variant, 0)]
-        advantages = np.concatenate(
-            [_advantages(benches[task], [row for row in chosen if row.task == task]) for task in benches]
-        )
-        gained = float(np.mean([row.gain_percent for row in chosen]))
-        lines.append(
-            f"| {group} | {count} | {variant} | {gained:.1f} | {(advantages > 0).sum()} of {len(advantages)} "
-            f"| {_interval(advantages)} |"
-        )
-    return "\n".join(lines)
-
-
-def table_of_advice(rows: Sequence[Row]) -> str:
-    """Who is told within 100 answers that more hardly pay, and what going on to 200 would have gained them."""
-    lines = ["| task | people | told | after | would have gained more than 3 points | in the mean |", "|" + "---|" * 6]
-    for task, group in product(catalogue.names(), GROUPS):
-        last = [row for row in rows if (row.task, row.group, row.variant, row.labels) == (task, group, "now", 200)]
-        told = [row for row in last if 0 < row.told_after <= 100]
-        lost = np.array([row.gain_percent - row.told_gain for row in told])
-        after = f"{np.mean([row.told_after for row in told]):.0f}" if told else "-"
-        mean = f"{lost.mean():.1f}" if told else "-"
-        low, high = wilson_interval(int((lost > 3.0).sum()), len(told)) if told else (0.0, 1.0)
-        wrong = f"{(lost > 3.0).sum()} of {len(told)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f} %]"
-        lines.append(f"| {task.capitalize()} | {group} | {len(told)} of {len(last)} | {after} | {wrong} | {mean} |")
-    return "\n".join(lines)
-
-
-def table_of_lengths(rows: Sequence[Row]) -> str:
-    """Of everybody, told or not: who would gain more than 3 points by going on to 200 answers."""
-    lines = ["| task | answers | would gain more than 3 points by going on | still to gain, mean |", "|" + "---|" * 4]
-    for task, count in product(catalogue.names(), COUNTS[:-1]):
-        now, last = (
-            np.concatenate([_by_user(rows, task, group, "now", each) for group in GROUPS])
-            for each in (count, COUNTS[-1])
-        )
-        lost = last - now
-        low, high = wilson_interval(int((lost > 3.0).sum()), len(lost))
-        wrong = f"{(lost > 3.0).sum()} of {len(lost)} [{100 * max(low, 0.0):.0f}, {100 * high:.0f} %]"
-        lines.append(f"| {task.capitalize()} | {count} | {wrong} | {lost.mean():.1f} |")
-    return "\n".join(lines)
-
-
-def _advantages(bench: FewAnswers, rows: Sequence[Row]) -> FloatArray:
+def advantages(bench: FewAnswers, rows: Sequence[Row]) -> FloatArray:
     """(U,) by how much everybody's own mode is better for them than the better of two others', in threes."""
     found = []
     for first in range(0, len(rows) - 2, 3):
