@@ -36,28 +36,6 @@ from worker.ml.teachers import Taste
 from worker.sim.costs import preference_rewards, stakes
 from worker.tasks import registry
 
-CHEAP_FIRST = (
-    "pbarl",
-    "pbarl_refined",
-    "pbarl_no_mode",
-    "pbarl_no_residual",
-    "pbarl_no_caution",
-    "sliders",
-    "preferential_bo",
-    "clusters_3",
-    "average",
-    "residual_rl",
-    "dsrl_flow",
-    "sliders_noisy",
-    "latent_people",
-    "dsrl",
-    "best_of_n",
-    "prefft_lagrangian",
-    "prefft",
-    "prefft_anchored",
-    "pbarl_printed",
-    "pbrl_hri",
-)
 TERMS: BenchmarkConfig = PROFILES["full"]
 
 
@@ -161,8 +139,8 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=catalogue.names(), default=catalogue.names())
     parser.add_argument("--users", nargs="+", type=spoken.taste, default=list(PAPER_USERS.values()))
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(CHEAP_FIRST))
-    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)))
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(rivals_report.CHEAP_FIRST))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(rivals_report.GOAL_SEEDS)))
     parser.add_argument(
         "--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts and finished cells"
     )
