@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from app.installed_tasks import catalogue
 from app.settings import Settings
-from tests.benchmarks import result_tables, rivals_report
+from tests.benchmarks import result_tables, rivals_picture, rivals_report
 from worker.analysis.comparison import result_pages
 from worker.commands import options as spoken
 from worker.domain.type_aliases import FloatArray
@@ -52,6 +52,7 @@ def main() -> None:
         os.nice(19 - os.nice(0))
         _measure(missing, rows, options)
     if rows:
+        options.output.with_suffix(".svg").write_bytes(rivals_picture.svg(rows))
         page = options.output.with_suffix(".md")
         page.write_text(result_pages.page(page, rivals_report.TITLE, rivals_report.page(rows)))
 

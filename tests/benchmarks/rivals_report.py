@@ -117,7 +117,7 @@ def _ahead(found: Mapping[Name, Row]) -> str:
         behind += change["high"] < 0
         ties += change["low"] <= 0 <= change["high"]
         if change["low"] > 0:
-            lost = _success(row)
+            lost = success_of(row)
             verdict = "keeps the task" if lost["delta"] >= -TOLERANCE else "loses the task"
             ahead.append(
                 f"* {task}, {user}, seed {seed}: `{method}` by {_interval(change)}; success"
@@ -145,7 +145,7 @@ def _ahead_over_seeds(found: Mapping[Name, Row]) -> str:
             behind += 1
             continue
         verdict = "ahead" if change["low"] > 0 else "within"
-        lost = min(_success(row)["delta"] for row in rivals)
+        lost = min(success_of(row)["delta"] for row in rivals)
         lines.append(
             f"* {task}, {user}, {len(seeds)} seeds: `{method}` by {_interval(change)} ({verdict}); success"
             f" {100 * lost:+.1f} points in the worst of them."
@@ -308,7 +308,8 @@ def _successes_of_reference(row: Row) -> FloatArray:
     return successes_of(row, "successes_reference")
 
 
-def _success(row: Row) -> dict[str, float]:
+def success_of(row: Row) -> dict[str, float]:
+    """Change of the share of episodes that succeed, against the reference policy's."""
     return success_change(_successes_of_reference(row), successes_of(row))
 
 

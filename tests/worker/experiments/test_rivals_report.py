@@ -46,7 +46,8 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
         ]
     )
     assert page.startswith("5 of 900 cells ")
-    assert "Not begun: `pbarl`, " in page and "`dsrl_flow`" in page.partition("Not begun: ")[2].splitlines()[0]
+    assert "Not begun: `pbarl`, " in page
+    assert "`dsrl_flow`" in page.partition("Not begun: ")[2].splitlines()[0]
     assert "`dsrl`," not in page.splitlines()[0]
     assert "The default is `pbarl_refined` in feeding;" in page
     assert "Of 3 comparisons the rival is behind in 1, within the interval in 0, and ahead in 2:" in page
