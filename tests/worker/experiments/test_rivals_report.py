@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.benchmarks import result_tables, rivals_report
+from tests.benchmarks import result_tables, rivals_picture, rivals_report
 from worker.domain.type_aliases import FloatArray
 
 
@@ -102,3 +102,15 @@ def test_the_folder_of_a_table_is_there_before_its_rows(tmp_path: Any) -> None:
     table = result_tables.stem(f"{tmp_path}/new/folder/rows").with_suffix(".csv")
     result_tables.write(table, [{"user": "neutral"}])
     assert result_tables.read(table) == [{"user": "neutral"}]
+
+
+def test_the_picture_has_every_training_and_says_what_lies_beyond_its_edge() -> None:
+    few, ones, half = np.full(100, 0.2), np.ones(100), (np.arange(100) % 2).astype(float)
+    rows = [row("pbarl_refined", few, ones, seed) for seed in range(3)]
+    lossy = [row("dsrl", few, half), row("prefft", few - 0.6, half)]
+
+    def marks(rows: list[Mapping[str, Any]]) -> int:
+        return rivals_picture.svg(rows).decode().count("<use ")
+
+    assert marks([*rows, *lossy]) - marks([]) == len([*rows, *lossy])
+    assert ">-40</text>" in rivals_picture.svg([*rows, *lossy]).decode()
