@@ -51,7 +51,7 @@ def _cell(axes: Axes, rows: Sequence[Row], task: str) -> None:
         axes.axvline(sum(default) / len(default), color=GREY, linestyle="--", linewidth=1, zorder=1)
     for row in rows:
         gain, place = _gain(row), CHEAP_FIRST.index(row["method"])
-        mark = KEPT if rivals_report.success_of(row)["delta"] >= -TOLERANCE else LOST
+        mark = KEPT if rivals_report.keeps_task(row) else LOST
         axes.plot(min(max(gain, LEAST), MOST), place, clip_on=False, **mark, **SIZE)
         if not LEAST <= gain <= MOST:
             at, side = (LEAST, "left") if gain < LEAST else (MOST, "right")

@@ -118,7 +118,7 @@ def _ahead(found: Mapping[Name, Row]) -> str:
         ties += change["low"] <= 0 <= change["high"]
         if change["low"] > 0:
             lost = success_of(row)
-            verdict = "keeps the task" if lost["delta"] >= -TOLERANCE else "loses the task"
+            verdict = "keeps the task" if keeps_task(row) else "loses the task"
             ahead.append(
                 f"* {task}, {user}, seed {seed}: `{method}` by {_interval(change)}; success"
                 f" {100 * lost['delta']:+.1f} points ({verdict})."
@@ -306,6 +306,12 @@ def _ages(found: Mapping[Name, Row]) -> str:
 
 def _successes_of_reference(row: Row) -> FloatArray:
     return successes_of(row, "successes_reference")
+
+
+def keeps_task(row: Row) -> bool:
+    """Whether no more than the tolerated share of episodes is lost; whole episodes are counted."""
+    lost = _successes_of_reference(row).sum() - successes_of(row).sum()
+    return bool(lost <= round(TOLERANCE * len(successes_of(row))))
 
 
 def success_of(row: Row) -> dict[str, float]:

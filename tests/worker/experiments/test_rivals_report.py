@@ -114,3 +114,12 @@ def test_the_picture_has_every_training_and_says_what_lies_beyond_its_edge() -> 
 
     assert marks([*rows, *lossy]) - marks([]) == len([*rows, *lossy])
     assert ">-40</text>" in rivals_picture.svg([*rows, *lossy]).decode()
+
+
+def test_who_loses_as_much_as_is_tolerated_keeps_the_task() -> None:
+    """2 of 100 and 10 of 500 are 2 points; as differences of shares 99 of 100 less 97 of 100 are a little more."""
+    episodes = np.arange(100)
+    for before, after, keeps in ((100, 98, True), (99, 97, True), (97, 95, True), (99, 96, False)):
+        each = {**row("pbarl", np.zeros(100), (episodes < after).astype(float))}
+        each["successes_reference"] = rivals_report.successes_text(episodes < before)
+        assert rivals_report.keeps_task(each) == keeps
