@@ -309,9 +309,8 @@ def _successes_of_reference(row: Row) -> FloatArray:
 
 
 def keeps_task(row: Row) -> bool:
-    """Whether no more than the tolerated share of episodes is lost; whole episodes are counted."""
-    lost = _successes_of_reference(row).sum() - successes_of(row).sum()
-    return bool(lost <= round(TOLERANCE * len(successes_of(row))))
+    """Whether no more than the tolerated share of episodes is lost."""
+    return success_of(row)["delta"] >= -TOLERANCE
 
 
 def success_of(row: Row) -> dict[str, float]:

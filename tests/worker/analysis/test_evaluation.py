@@ -107,3 +107,11 @@ def test_a_difference_of_means_has_students_interval() -> None:
     change = np.random.default_rng(1).standard_normal(12)
     found = mean_change(np.zeros(12), change)
     assert [found["low"], found["high"]] == pytest.approx(stats.ttest_1samp(change, 0).confidence_interval())
+
+
+@pytest.mark.parametrize("before", [99, 98, 97, 91])
+def test_a_loss_of_success_is_as_large_as_the_episodes_say(before: int) -> None:
+    """Three of 100 are within a tolerance of 3 points, though .96 - .99 is a little less than -.03."""
+    episodes = np.arange(100)
+    change = success_change((episodes < before).astype(float), (episodes < before - 3).astype(float))
+    assert change["delta"] >= -0.03

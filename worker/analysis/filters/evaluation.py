@@ -63,7 +63,7 @@ def success_change(before: FloatArray, after: FloatArray) -> dict[str, float]:
     (low_before, high_before), (low_after, high_after) = (
         wilson_interval(float(values.sum()), count) for values in (before, after)
     )
-    delta, phi = rates[1] - rates[0], _correlation(before, after)
+    delta, phi = float((after - before).mean()), _correlation(before, after)  # of whole episodes: exact at a tolerance
     down, up = rates[1] - low_after, high_after - rates[1]
     before_down, before_up = rates[0] - low_before, high_before - rates[0]
     low = delta - float(np.sqrt(max(down**2 - 2 * phi * down * before_up + before_up**2, 0.0)))
