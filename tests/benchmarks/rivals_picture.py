@@ -21,14 +21,15 @@ SIZE: Mapping[str, Any] = {"markersize": 4.5, "linestyle": "none"}
 
 
 def svg(rows: Sequence[Row]) -> bytes:
-    """Gains by method; the line is the default's mean, which hollow triangles beyond it do not beat: they fail more."""
+    """Gains by method in every cell, with the default's mean as a line. Hollow: the task is not kept."""
+    methods = list(dict.fromkeys([*CHEAP_FIRST, *(row["method"] for row in rows)]))
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.2, 10.4), layout="constrained")
         grid = figure.subplots(len(catalogue.names()), len(PAPER_USERS), sharex=True, sharey=True)
         for down, task in enumerate(catalogue.names()):
             for across, user in enumerate(PAPER_USERS):
                 mine = [row for row in rows if (row["task"], row["user"]) == (task, user)]
-                _cell(grid[down, across], mine, task)
+                _cell(grid[down, across], mine, task, methods)
                 grid[down, across].set_title(f"{task.capitalize()}, {user}")
         figure.supxlabel("Change of true preference, % of what the user minds and likes", fontsize=9)
         marks = {f"keeps the task within {100 * TOLERANCE:.0f} points": KEPT, "loses more of it": LOST}
@@ -39,18 +40,18 @@ def svg(rows: Sequence[Row]) -> bytes:
     return rendered(figure)["svg"]
 
 
-def _cell(axes: Axes, rows: Sequence[Row], task: str) -> None:
-    """One point per training; methods from the top in the order in which the table names them."""
+def _cell(axes: Axes, rows: Sequence[Row], task: str, methods: Sequence[str]) -> None:
+    """One point per training; methods from the top."""
     axes.set_xlim(LEAST, MOST)
-    axes.set_ylim(len(CHEAP_FIRST) - 0.5, -0.5)
-    axes.set_yticks(range(len(CHEAP_FIRST)), CHEAP_FIRST, fontsize=7)
-    axes.hlines(range(len(CHEAP_FIRST)), LEAST, MOST, color=PALE, linewidth=0.5, zorder=0)
+    axes.set_ylim(len(methods) - 0.5, -0.5)
+    axes.set_yticks(range(len(methods)), methods, fontsize=7)
+    axes.hlines(range(len(methods)), LEAST, MOST, color=PALE, linewidth=0.5, zorder=0)
     axes.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
     default = [_gain(row) for row in rows if row["method"] == default_method(task)]
     if default:
         axes.axvline(sum(default) / len(default), color=GREY, linestyle="--", linewidth=1, zorder=1)
     for row in rows:
-        gain, place = _gain(row), CHEAP_FIRST.index(row["method"])
+        gain, place = _gain(row), methods.index(row["method"])
         mark = KEPT if rivals_report.keeps_task(row) else LOST
         axes.plot(min(max(gain, LEAST), MOST), place, clip_on=False, **mark, **SIZE)
         if not LEAST <= gain <= MOST:

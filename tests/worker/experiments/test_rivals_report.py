@@ -114,6 +114,7 @@ def test_the_picture_has_every_training_and_says_what_lies_beyond_its_edge() -> 
 
     assert marks([*rows, *lossy]) - marks([]) == len([*rows, *lossy])
     assert ">-40</text>" in rivals_picture.svg([*rows, *lossy]).decode()
+    assert ">pbarl_n1</text>" in rivals_picture.svg([row("pbarl_n1", few, ones)]).decode(), "not among those aimed at"
 
 
 def test_who_loses_as_much_as_is_tolerated_keeps_the_task() -> None:
