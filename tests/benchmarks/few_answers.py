@@ -6,10 +6,12 @@ Scripted users (5 % mistakes, 10 % "equal") answer pairs of a pool as large as a
 random, a model every ten answers, every twenty from 100 on. "before" is what was done until decision 135: nobody is
 known, and a mode's return counts less by the deviation of the model's members. "now, but for one thing": the prior of
 decision 135, without people to whom one thing matters. "pooled": twelve earlier people of the population are known as
-well; before, they were the whole prior. The search picks the user's mode without trials; its
-gain of the true preference, in % of what the user minds and likes under the reference policy, is what the response
-surface predicts. Models are posteriors without the temperature of their probabilities, which hardly matters to what is
-asked. Every finished chain is kept in --output: repeat the command to go on.
+well; before, they were the whole prior. The search picks the user's mode without trials; its gain of the true
+preference, in % of what the user minds and likes under the reference policy, is what the response surface predicts.
+Where refinements are usual, their gate keeps a policy that was refined beforehand instead, if the model says clearly
+that it is better: what these change is driven, no refinement is trained. Models are posteriors without the
+temperature of their probabilities, which hardly matters to what is asked. Every finished chain is kept in --output:
+repeat the command to go on.
 """
 
 import csv
@@ -31,11 +33,15 @@ from tests.benchmarks.chosen_modes import stake
 from tests.benchmarks.few_answers_report import GROUPS, TITLE, VARIANTS, WITHOUT, Row
 from worker.analysis.comparison import result_pages
 from worker.domain.responses import TARGETS
+from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.trajectory import SIGNALS
 from worker.domain.type_aliases import FloatArray
+from worker.experiments.rollout_cache import RolloutCache
 from worker.ml import acquisition
+from worker.ml.filters.fitting.gate import chance_of_gain, signal_changes
 from worker.ml.filters.fitting.mode_worth import price_of_failures
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
+from worker.ml.reinforcement.refinement_gate import LEAST_LIFT, SURE
 from worker.ml.rewards.bradley_terry import probability_right
 from worker.ml.rewards.prior import ONE_MATTERS, Population, Prior
 from worker.ml.rewards.reward_models import NEVER_WANTED
@@ -49,6 +55,8 @@ EARLIER = range(900, 912)
 FIRST = 500
 """of the numbers of people whom no choice was made by"""
 COSTS = [column for column, name in enumerate(SIGNALS) if name in NEVER_WANTED]
+DRIVEN = 200
+"""scenarios that the archived policies are driven through"""
 WORTHWHILE = (3.0, 60.0)
 """% of the stake that the best mode gains. Others outside the population are drawn again"""
 
@@ -68,7 +76,11 @@ class Wish(NamedTuple):
 
     def gain(self, surface: ResponseSurface, mode: FloatArray) -> float:
         """% of the stake that a mode gains."""
-        return float(surface.predict(mode)[0] @ self.weights / self.unit)
+        return self.worth(surface.predict(mode)[0])
+
+    def worth(self, changes: FloatArray) -> float:
+        """% of the stake that (S,) changes of signals are worth."""
+        return float(changes @ self.weights / self.unit)
 
 
 class FewAnswers(Bench):
@@ -84,6 +96,7 @@ class FewAnswers(Bench):
             "outside": {taste.name: taste for taste in (self._outsider(FIRST + each) for each in range(people))},
         }
         self.priors = self._priors()
+        self.archived = archived_changes(name, pools)
 
     def rows(self, chain: Chain) -> Iterator[Row]:
         """Answer, learn, choose, and so on."""
@@ -113,6 +126,7 @@ class FewAnswers(Bench):
                     *chain,
                     labels=count,
                     gain_percent=round(wish.gain(self.surface, mode), 3),
+                    kept_percent=round(wish.worth(self._kept(mode, wanted)), 3),
                     best_percent=round(wish.best, 3),
                     success_points=round(success, 3),
                     like_nobody_known=round(nobody, 3),
@@ -120,6 +134,18 @@ class FewAnswers(Bench):
                     told_gain=round(told_gain, 3),
                     mode=" ".join(f"{each:.3f}" for each in mode),
                 )
+
+    def _kept(self, mode: FloatArray, wanted: FloatArray) -> FloatArray:
+        """(S,) what changes with what the gate of a refinement keeps where learning finds nothing better.
+
+        The archived policy that the model likes best, where that is better enough than the mode and surely so; else
+        the mode. ``wanted``: (E, S), members.
+        """
+        alone = self.surface.predict(mode)[0]
+        least = LEAST_LIFT * max(0.0, float(alone @ wanted.mean(axis=0)))
+        best = max(self.archived, key=lambda changes: float(changes @ wanted.mean(axis=0)), default=alone)
+        gains = best @ wanted.T
+        return best if gains.mean() > least and chance_of_gain(gains) >= SURE else alone
 
     def _ask(
         self, count: int, asked: acquisition.Indices, members: FloatArray | None, rng: np.random.Generator
@@ -204,6 +230,16 @@ class FewAnswers(Bench):
         )
 
 
+def archived_changes(name: str, directory: Path) -> FloatArray:
+    """(P, S) by how much an episode's signals change with each policy that was refined beforehand."""
+    cached, unseen = RolloutCache(name, directory / "rollouts"), first_of(EVALUATION, DRIVEN)
+    archived = [each.driven for each in cached.archived(unseen)]
+    if not archived:
+        return np.zeros((0, len(SIGNALS)))
+    reference = cached.reference(unseen)
+    return np.array([signal_changes(reference, driven).mean(axis=0) for driven in archived])
+
+
 def cautious_mode(surface: ResponseSurface, members: FloatArray, seed: int) -> FloatArray:
     """What best_mode() was until decision 135: the members' deviation is subtracted from a mode's return."""
     rng, width = np.random.default_rng(seed), surface.high - surface.low
@@ -277,6 +313,7 @@ def finished(file: Path) -> dict[Chain, list[Row]]:
             *who,
             labels=int(row["labels"]),
             gain_percent=float(row["gain_percent"]),
+            kept_percent=float(row["kept_percent"]),
             best_percent=float(row["best_percent"]),
             success_points=float(row["success_points"]),
             like_nobody_known=float(row["like_nobody_known"]),

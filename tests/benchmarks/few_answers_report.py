@@ -30,6 +30,8 @@ class Row(NamedTuple):
     variant: str
     labels: int
     gain_percent: float
+    kept_percent: float
+    """the same of what a refinement that finds nothing better leaves"""
     best_percent: float
     success_points: float
     like_nobody_known: float
@@ -49,6 +51,7 @@ def page(rows: Sequence[Row], advantages: Advantages) -> str:
     """All below the mark."""
     tables = [
         _table_of_gains(rows),
+        _table_of_archives(rows),
         _table_of_one_thing(rows),
         _table_of_pooling(rows, advantages),
         _table_of_advice(rows),
@@ -76,6 +79,28 @@ def _table_of_gains(rows: Sequence[Row]) -> str:
             for now, before in ((25, 100), (50, 200), (100, 100), (200, 200))
         ]
         lines.append(f"| {task.capitalize()} | {group} | {best:.1f} | " + " | ".join([*means, *compared]) + " |")
+    return "\n".join(lines)
+
+
+def _table_of_archives(rows: Sequence[Row]) -> str:
+    """What refinements that find nothing better leave, against the mode of before, where anybody's is not the mode."""
+    lines = [
+        "| task | people | with policies refined beforehand, now: 25 | 50 | 100 | 200 "
+        "| 25 - before 100 | 50 - before 200 | not the mode at 25 |",
+        "|" + "---|" * 9,
+    ]
+    for task, group in product(catalogue.names(), GROUPS):
+        kept = {count: _by_user(rows, task, group, "now", count, "kept_percent") for count in COUNTS}
+        others = kept[25] != _by_user(rows, task, group, "now", 25)
+        if not others.any():
+            continue
+        means = [f"{each.mean():.1f}" for each in kept.values()]
+        compared = [
+            _interval(kept[now] - _by_user(rows, task, group, "before", before))
+            for now, before in ((25, 100), (50, 200))
+        ]
+        cells = [task.capitalize(), group, *means, *compared, f"{others.sum()} of {len(others)}"]
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -145,12 +170,14 @@ def _table_of_lengths(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _by_user(rows: Sequence[Row], task: str, group: str, variant: str, labels: int) -> FloatArray:
+def _by_user(
+    rows: Sequence[Row], task: str, group: str, variant: str, labels: int, of: str = "gain_percent"
+) -> FloatArray:
     """(U,) gains, the mean over seeds."""
     gains: dict[str, list[float]] = {}
     for row in rows:
         if (row.task, row.group, row.variant, row.labels) == (task, group, variant, labels):
-            gains.setdefault(row.user, []).append(row.gain_percent)
+            gains.setdefault(row.user, []).append(getattr(row, of))
     return np.array([np.mean(each) for each in gains.values()])
 
 
