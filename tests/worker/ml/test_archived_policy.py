@@ -27,6 +27,7 @@ CHECKED = range(100, 110)
 FAR = -0.67
 """mean action of the first joint, which moved(-3.0) is below, in any state"""
 NO_MODE = FilterDraft(FilterWeights())
+WEAK_MODE = FilterDraft(FilterWeights(mode={"speed_near": -0.3}, gate=0.3))
 DISLIKES = FilterProblem(invented.TASK, POLICY, REWARD, 0, FilterConfig(success_tolerance=0.05))
 """somebody who dislikes the first joint's action"""
 ONLY_IMITATED = Refinement(
@@ -79,13 +80,14 @@ def test_whose_own_mode_is_better_than_all_of_them_begins_as_that(reference: lis
     assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], reference) == (NO_MODE, [])
 
 
-def test_a_refinement_begins_as_the_archived_policy(reference: list[Trajectory]) -> None:
+@pytest.mark.parametrize("mode", [NO_MODE, WEAK_MODE])
+def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajectory], mode: FilterDraft) -> None:
     policy = moved(-1.0)
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(policy)], reference)
+    start, _ = best_beginning(DISLIKES, mode, [archived(policy)], reference)
     beginning = Beginning(World, [], reference, reference, collect)
     begun, *_ = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
     seen = invented.observations(300, np.random.default_rng(9))
-    imitated = act_of(invented.TASK.modes, POLICY, begun.weights).batch(seen)
+    imitated = act_of(invented.TASK.modes, POLICY, begun.weights.changed(gate=1.0)).batch(seen)
     assert np.abs(imitated - policy.mean(seen)).mean() < 0.05
     assert np.abs(imitated - POLICY.mean(seen)).mean() > 0.05
 

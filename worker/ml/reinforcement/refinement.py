@@ -202,13 +202,19 @@ def _train(
                     learner.update(training.replay, actor=False)
 
         if kept is None:
-            _imitate(learner, training, act_of(problem.task.modes, problem.policy, draft.weights), config)
+            _imitate(learner, training, _begun_as(problem, draft), config)
             look()
         else:
             training.restore(learner, *kept)
         training.learn(learner, checkpoint, move_tie, until)
         training.close()
     return learner
+
+
+def _begun_as(problem: FilterProblem, draft: FilterDraft) -> FilterAct:
+    """The mode at its strength, or the archived policy, which is whole however much the mode was weakened."""
+    weights = draft.weights.changed(gate=1.0) if draft.weights.refined else draft.weights
+    return act_of(problem.task.modes, problem.policy, weights)
 
 
 def _imitate(learner: WatchedLearner, training: PreferenceRl, act: FilterAct, config: Refinement) -> None:
