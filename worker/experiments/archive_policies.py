@@ -2,14 +2,14 @@
 
 Each is for somebody who minds one signal especially, and begins as the best that was found for anybody. What is
 finished is archived at once, and the last training goes on from its checkpoint, so an interrupted run goes on where it
-was; with another work directory, what is archived already is improved.
+was; with another work directory everybody is refined once more, from the best that is archived by then.
 """
 
 import json
 import platform
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,9 @@ ARCHETYPES = (
     Archetype("slow_near", "near_speed_squared_m2_s2"),
     Archetype("clean", "spilled"),
     Archetype("fast_near", "near_speed_squared_m2_s2", 1.0),
+    Archetype("close", "lateral_offset_m"),
+    Archetype("wide", "lateral_offset_m", 1.0),
+    Archetype("slow", "speed_squared_m2_s2"),
 )
 
 
@@ -88,8 +91,8 @@ def archive_policies(
     """Refine policies for people who mind one signal each, from which everybody's refinement may begin, and record it.
 
     Six to twenty minutes for each of them, one after the other: every one begins as the best of all that are archived,
-    and takes the place of that person's earlier one if it ends better than it began. Who is finished in the work
-    directory is not refined again.
+    and is archived beside that person's earlier ones if it ends better than it began: what serves them better may serve
+    others worse. Who is finished in the work directory is not refined again.
     Raises NothingToRefine for a laboratory's task, and for one without a response surface.
     """
     if registry.task(task).is_a_labs:
@@ -120,25 +123,32 @@ class _Making:
 
     def refine(self, archetype: Archetype, seed: int) -> None:
         """Refine a policy for somebody, unless that is done, and archive it if it is better than where it began."""
-        name, done = archetype.name, self.work / f"{archetype.name}-done"
-        if done.exists() and name in self.entries:
+        done = self.work / f"{archetype.name}-done"
+        if done.exists() and archetype.name in self.entries:
             return
+        name = self._new_name(archetype)
         policy, reward = simulation.reference_policy(self.name), self._reward(archetype)
         problem = FilterProblem(self.task, policy, reward, seed, self.gates)
-        refined, trials = self._refined(problem, self.work / f"{name}-training")
+        refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
         loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
         if loss is not None and loss <= LARGEST_LOSS:
             file = self.folder / f"{name}.safetensors"
             with written_whole(file) as draft:
                 GaussianPolicy(dict(refined)).save(draft)
             self.archived[name] = self._driven(file)
-        self.entries[name] = {**asdict(archetype), "trials": trials, "loss": loss, "kept": name in self.archived}
+        policy_of = asdict(replace(archetype, name=name))
+        self.entries[name] = {**policy_of, "trials": trials, "loss": loss, "kept": name in self.archived}
         with written_whole(self._record_file) as draft:
             draft.write_text(json.dumps(self.record(), indent=2) + "\n")
         done.touch()
 
+    def _new_name(self, archetype: Archetype) -> str:
+        """Of the next policy for somebody: "level", then "level_2"."""
+        is_of = [(each["signal"], each["sign"]) == (archetype.signal, archetype.sign) for each in self.entries.values()]
+        return f"{archetype.name}_{1 + sum(is_of)}" if any(is_of) else archetype.name
+
     def record(self) -> dict[str, Any]:
-        """How the archive came to be; the trials are those of the last training for each of them."""
+        """How the archive came to be, training by training."""
         return {
             "command": f"python -m worker archive-policies --task {self.name}",
             "steps": self.config.steps,
