@@ -10,6 +10,7 @@ import pytest
 
 from app.installed_tasks import catalogue
 from app.installed_tasks.by_name import usual_refinement_steps
+from tests.benchmarks.archived_policies import MODE, tables
 from worker.__main__ import main
 from worker.compute import simulation
 from worker.domain.trajectory import Trajectory
@@ -100,6 +101,25 @@ def test_an_archive_ships_with_the_policies_that_its_record_names(task: str) -> 
         assert isinstance(policy, GaussianPolicy)
         assert policy.offset.tolist() == reference.weights["offset"].tolist()
         assert policy.action_size == reference.action_size
+
+
+def test_the_page_says_whom_each_policy_serves_best_and_what_would_be_lost_without_it() -> None:
+    gains = {
+        "named": {"a": (1.0, 2.0, 3.0)},
+        "drawn": {"b": (1.0, 5.0, 2.0), "c": (1.0, 3.0, 2.0), "d": (9.0, 1.0, 3.0)},
+        "outside": {"e": (0.0, 1.0, 1.5), "f": (0.0, -1.0, -2.0), "g": (4.0, 0.0, 5.0)},
+    }
+    outcome = {"success_points": -0.5, "pressed_percent": 1.0}
+    rows = [
+        {"task": "feeding", "group": group, "user": user, "policy": policy, "gain_percent": gain, **outcome}
+        for group, users in gains.items()
+        for user, each in users.items()
+        for policy, gain in zip((MODE, "even", "level"), each, strict=True)
+    ]
+    page = tables(rows)
+    assert "| feeding | drawn, 3 | +3.7 [-7.8, +15.1] | +3.7 [+0.8, +6.5] | +5.7 [-1.9, +13.3] | 67 % |" in page
+    assert "| feeding | `even` | -0.5 | 1.0 % | 67 % | 1.33 | 0 % | 0.00 |" in page
+    assert "| feeding | `level` | -0.5 | 1.0 % | 0 % | 0.00 | 67 % | 0.50 |" in page
 
 
 def test_a_task_that_was_not_explored_is_told_what_to_do(
