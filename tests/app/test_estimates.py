@@ -1,5 +1,6 @@
 """How long somebody still waits: measured on earlier work of the same kind, and unknown when there was none."""
 
+import sys
 from collections.abc import Callable
 from datetime import timedelta
 from itertools import count
@@ -47,7 +48,7 @@ def took(
 
 def at_work(session: Session, person: Participant, study: Study, kind: RunKind, done: float, for_s: float) -> Run:
     columns = {"kind": kind, "status": RunStatus.RUNNING, "progress": done, "finished_at": None}
-    run = factories.make_run(session, study, person, started_at=estimates.now() - timedelta(seconds=for_s), **columns)
+    run = factories.make_run(session, study, person, started_at=now() - timedelta(seconds=for_s), **columns)
     run.workflow_id = f"{kind}/participant-{person.id}/labels-{LABELS}/answer-{next(_numbers)}"
     return run
 
@@ -56,7 +57,8 @@ def at_work(session: Session, person: Participant, study: Study, kind: RunKind, 
 def time_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is at work since 90 s is so, too, on a machine that takes a minute for the rest of the test."""
     moment = now()
-    monkeypatch.setattr(estimates, "now", lambda: moment)
+    for module in (estimates, sys.modules[__name__]):
+        monkeypatch.setattr(module, "now", lambda: moment)
 
 
 @pytest.fixture
@@ -146,7 +148,7 @@ def test_a_filter_of_others_that_is_not_fitted_yet_counts_and_its_trouble_is_tol
         took(session, earlier, here, RunKind.FILMS, 30, "trials")
         run = factories.make_run(session, study, kind=RunKind.SHARED, status=RunStatus.RUNNING, progress=0.5)
         run.workflow_id = str(donors.key_of(shared))
-        run.started_at, run.finished_at = estimates.now() - timedelta(seconds=240), None
+        run.started_at, run.finished_at = now() - timedelta(seconds=240), None
     assert "About 5 minutes to go" in look()
     with database.writing() as session:
         session.get_one(Run, run.id).status = RunStatus.FAILED
