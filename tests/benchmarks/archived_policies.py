@@ -26,12 +26,11 @@ from worker.compute import simulation
 from worker.domain.scenarios import EVALUATION, first_of
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.rollout_cache import RolloutCache
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.gate import largest_forces, signal_changes, successes
 
 TITLE = "# What policies refined beforehand are worth"
 MODE = "best mode"
-PRESSED_N = 5.0
-"""of growth of an episode's largest force, from which on somebody counts as pressed"""
 Row = dict[str, Any]
 
 
@@ -66,7 +65,7 @@ def _driven(name: str, directory: Path) -> Iterator[tuple[str, FloatArray, Row]]
     reference = cached.reference(unseen)
     for policy, archived in zip(simulation.archived_policies(name), cached.archived(unseen), strict=True):
         changed = successes(archived.driven) - successes(reference)
-        pressed = largest_forces(archived.driven) - largest_forces(reference) > PRESSED_N
+        pressed = largest_forces(archived.driven) - largest_forces(reference) > FilterConfig.pressed_n
         outcome = {
             "success_points": round(100 * float(changed.mean()), 2),
             "pressed_percent": round(100 * float(pressed.mean()), 2),
@@ -103,8 +102,8 @@ _HEAD_OF_WORTH = (
 )
 _HEAD_OF_POLICIES = (
     "",
-    f"Success beside the reference policy's in points, and how often somebody is pressed more than {PRESSED_N:g} N",
-    f"harder, in {DRIVEN} scenarios. *Best for*: share of people for whom nothing else, mode or archived, gains more.",
+    "Success beside the reference policy's in points, and how often somebody is pressed more than",
+    f"{FilterConfig.pressed_n:g} N harder, in {DRIVEN} scenarios. *Best for*: share of people for whom nothing else, mode or archived, gains more.",
     "*Lost*: points by which the better of both would fall in the mean if the policy were not there.",
     "",
     "| task | policy | success | pressed | best for drawn | lost by drawn | best for outside | lost by outside |",
