@@ -103,8 +103,9 @@ _HEAD_OF_WORTH = (
 _HEAD_OF_POLICIES = (
     "",
     "Success beside the reference policy's in points, and how often somebody is pressed more than",
-    f"{FilterConfig.pressed_n:g} N harder, in {DRIVEN} scenarios. *Best for*: share of people for whom nothing else, mode or archived, gains more.",
-    "*Lost*: points by which the better of both would fall in the mean if the policy were not there.",
+    f"{FilterConfig.pressed_n:g} N harder, in {DRIVEN} scenarios.",
+    "*Best for*: share of people for whom nothing else, mode or archived, gains more. *Lost*: points by which the better",
+    "of both would fall in the mean if the policy were not there.",
     "",
     "| task | policy | success | pressed | best for drawn | lost by drawn | best for outside | lost by outside |",
     "|---|---|---|---|---|---|---|---|",
