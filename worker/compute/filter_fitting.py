@@ -141,17 +141,19 @@ class FilterFit:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        draft, archived = self._best_beginning(mode)
+        draft, archived = self._best_beginning(mode, known)
         return refining.Training(self.task, self.problem, draft, archived, known, reference, looks, config)
 
-    def _best_beginning(self, draft: FilterDraft) -> tuple[FilterDraft, Sequence[Trajectory]]:
+    def _best_beginning(
+        self, draft: FilterDraft, known: Sequence[Trajectory]
+    ) -> tuple[FilterDraft, Sequence[Trajectory]]:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
         self.progress("comparing the mode with policies that were refined beforehand", 0.33)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
             driven = self._driven(f"{self.task} refined beforehand: {name}", policy, scenarios)
-            archived.append(ArchivedPolicy(policy, driven))
-        return best_beginning(self.problem, draft, archived, self._gate_reference())
+            archived.append(ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name)))
+        return best_beginning(self.problem, draft, archived, known, self._gate_reference(), self.collect)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""

@@ -22,6 +22,7 @@ from worker.domain.scenarios import NORMALISATION
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
@@ -113,6 +114,17 @@ def archived_policies(name: str) -> Mapping[str, GaussianPolicy]:
     return {file.stem: GaussianPolicy.load(file) for file in whole_files(archive_folder(name), "*.safetensors")}
 
 
+def surface_around_file(name: str, policy: str) -> Path:
+    """Where the response surface of modes around one of them is kept."""
+    return archive_folder(name) / "around" / f"{policy}.safetensors"
+
+
+def surface_around(name: str, policy: str) -> ResponseSurface | None:
+    """What modes change around an archived policy, beside that policy itself; None: they were not explored."""
+    file, described = surface_around_file(name, policy), task(name)
+    return ResponseSurface.load(file, described.modes, described.signals) if file.exists() else None
+
+
 @cache
 def signal_predictor(name: str) -> SignalPredictor:
     """What foresees a task's signals from state and action. Raises NoPredictor for a task that has none."""
@@ -158,9 +170,9 @@ def behaviours(name: str, scenario: int, count: int) -> list[Behaviour]:
     return draw_behaviours(task(name), scenario, count, early_policies(name), sampled)
 
 
-def act_in_mode(name: str, mode: npt.ArrayLike) -> Act:
-    """The frozen policy executed in a mode (A,)."""
-    policy = reference_policy(name, task(name).modes.policy(mode))
+def act_in_mode(name: str, mode: npt.ArrayLike, refined: str = "") -> Act:
+    """The frozen policy executed in a mode (A,), or one that was ``refined`` beforehand."""
+    policy = archived_policies(name)[refined] if refined else reference_policy(name, task(name).modes.policy(mode))
     return _in_mode(task(name), policy.mean, np.asarray(mode, np.float32))
 
 

@@ -20,9 +20,10 @@ from tqdm import tqdm
 
 from app.installed_tasks.by_name import usual_clip_steps
 from worker.compute import learning, shared_reward, simulation
-from worker.domain.scenarios import POLICY_TEST, POOL, first_of
+from worker.domain.scenarios import POLICY_TEST, POOL, RESPONSE_SURFACE, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array
+from worker.experiments.fit_response_surface import BLOCK, Block, compare_block, joined, random_modes
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.acquisition import matched_pairs
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
@@ -48,6 +49,8 @@ POOL_SCENARIOS = 48
 TEST_SCENARIOS = 500
 LARGEST_LOSS = 0.005
 """of success in these: half of what somebody's own may lose in fewer, as what is archived is there for everybody"""
+SCENARIOS_AROUND = 150
+"""each in twelve modes around an archived policy"""
 ESPECIALLY = 2.0
 """times as much what is minded especially differs in a pair as everything else does, by the weights"""
 
@@ -107,6 +110,30 @@ def archive_policies(
     return making.record()
 
 
+def explored_around(task: str, policy: str, work: Path) -> ResponseSurface:
+    """What modes change around an archived policy, beside that policy itself, as it is kept with it.
+
+    It is explored and fitted where it is not there yet, which takes minutes; blocks finished in the work directory are
+    kept.
+    """
+    if (known := simulation.surface_around(task, policy)) is not None:
+        return known
+    file, folder = simulation.surface_around_file(task, policy), work / f"{policy}-around"
+    described = registry.task(task)
+    folder.mkdir(parents=True, exist_ok=True)
+    firsts = first_of(RESPONSE_SURFACE, SCENARIOS_AROUND)[::BLOCK]
+    blocks = [Block(task, each, random_modes(described, each), folder / f"{each}.npz", policy) for each in firsts]
+    for block in tqdm(blocks, unit="block", desc=f"modes around {policy}"):
+        if not block.is_there():
+            compare_block(block)
+    file.parent.mkdir(exist_ok=True)
+    surface = joined(blocks).fit(described)
+    with written_whole(file) as draft:
+        surface.save(draft)
+    shutil.rmtree(folder)
+    return surface
+
+
 class _Making:
     """The archive of one task in the making."""
 
@@ -117,7 +144,7 @@ class _Making:
         self.pairs, self.scale = self._shown()
         self.folder = simulation.archive_folder(task)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.archived = {file.stem: self._driven(file) for file in whole_files(self.folder, "*.safetensors")}
+        self.archived = {file.stem: self._explored(file.stem) for file in whole_files(self.folder, "*.safetensors")}
         known = json.loads(self._record_file.read_text())["archetypes"] if self._record_file.exists() else []
         self.entries: dict[str, dict[str, Any]] = {each["name"]: each for each in known}
 
@@ -132,10 +159,9 @@ class _Making:
         refined, trials = self._refined(problem, self.work / f"{archetype.name}-training")
         loss = self._loss(GaussianPolicy(dict(refined))) if refined else None
         if loss is not None and loss <= LARGEST_LOSS:
-            file = self.folder / f"{name}.safetensors"
-            with written_whole(file) as draft:
+            with written_whole(self.folder / f"{name}.safetensors") as draft:
                 GaussianPolicy(dict(refined)).save(draft)
-            self.archived[name] = self._driven(file)
+            self.archived[name] = self._explored(name)
         policy_of = asdict(replace(archetype, name=name))
         self.entries[name] = {**policy_of, "trials": trials, "loss": loss, "kept": name in self.archived}
         with written_whole(self._record_file) as draft:
@@ -160,9 +186,12 @@ class _Making:
     def _record_file(self) -> Path:
         return self.folder / "archive.json"
 
-    def _driven(self, file: Path) -> ArchivedPolicy:
-        policy, gate = GaussianPolicy.load(file), self.gates.gate_block(self.task)
-        return ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0))
+    def _explored(self, name: str) -> ArchivedPolicy:
+        """A policy that is archived, with what modes change around it."""
+        simulation.archived_policies.cache_clear()
+        policy, gate = simulation.archived_policies(self.name)[name], self.gates.gate_block(self.task)
+        around = explored_around(self.name, name, self.work)
+        return ArchivedPolicy(policy, self._collect(PolicyAct(policy), gate, 0.0, 0), around)
 
     def _loss(self, policy: GaussianPolicy) -> float:
         """Of success, as a share of scenarios in which nothing was tried before."""
@@ -176,7 +205,8 @@ class _Making:
         gate, watched = reference(config.gate_block(self.task)), reference(config.watch_block(self.task))
         surface = ResponseSurface.load(simulation.surface_file(self.name), self.task.modes, self.task.signals)
         mode = find_mode(problem, surface, self.pool, gate, self._collect)
-        start, archived = best_beginning(problem, mode, list(self.archived.values()), gate)
+        known, policies = self.pool.rollouts, list(self.archived.values())
+        start, archived = best_beginning(problem, mode, policies, known, gate, self._collect)
         folder.mkdir(exist_ok=True)
         make_env = registry.environment_class(self.name)
         beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, archived)

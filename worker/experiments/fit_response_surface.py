@@ -95,6 +95,8 @@ class Block:
     modes: FloatArray
     """(BLOCK, modes of each, A)"""
     file: Path
+    refined: str = ""
+    """name of the policy, refined beforehand, that is executed and compared with; empty: the frozen one is"""
 
     def is_there(self) -> bool:
         """Whether it was run, in these modes."""
@@ -126,7 +128,7 @@ def explore(
         work_directory.mkdir(exist_ok=True)
     described = registry.task(task)
     blocks = [
-        Block(task, first, _random_modes(described, first), work_directory / f"differences-{first}.npz")
+        Block(task, first, random_modes(described, first), work_directory / f"differences-{first}.npz")
         for first in first_of(RESPONSE_SURFACE, scenarios)[::BLOCK]
     ]
     compute = Compute(processes)
@@ -179,13 +181,14 @@ def _is_known(task: str, described: LabDescription, environment: LabEnvironment)
 
 def compare_block(block: Block) -> None:
     """Differences of one block of scenarios, written to a file that is either complete or absent."""
-    policy = simulation.reference_policy(block.task)
+    archived, refined = simulation.archived_policies(block.task), block.refined
+    policy = archived[refined] if refined else simulation.reference_policy(block.task)
     signals, success, reference_success, growth = [], [], [], []
     for scenario, modes in zip(range(block.first, block.first + BLOCK), block.modes, strict=True):
         reference = simulation.run_episode(block.task, policy.mean, scenario)
         reference_success.append(reference.success)
         for mode in modes:
-            changed = simulation.run_episode(block.task, simulation.act_in_mode(block.task, mode), scenario)
+            changed = simulation.run_episode(block.task, simulation.act_in_mode(block.task, mode, refined), scenario)
             signals.append(
                 changed.signals.sum(axis=0, dtype=np.float64) - reference.signals.sum(axis=0, dtype=np.float64)
             )
@@ -198,7 +201,8 @@ def compare_block(block: Block) -> None:
         np.savez(draft, **vars(found))
 
 
-def _random_modes(task: Task, first: int) -> FloatArray:
+def random_modes(task: Task, first: int) -> FloatArray:
+    """(BLOCK, modes of each scenario, A) of a block."""
     return np.array(
         [
             task.modes.sample(MODES_PER_SCENARIO, np.random.default_rng([scenario, 2]))

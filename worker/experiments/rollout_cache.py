@@ -43,11 +43,13 @@ class RolloutCache:
 
     def archived(self, scenarios: Sequence[int]) -> list[ArchivedPolicy]:
         """The task's policies that were refined beforehand, in these scenarios."""
-        return [self._archived(policy, scenarios) for policy in simulation.archived_policies(self.task).values()]
+        policies = simulation.archived_policies(self.task)
+        return [self._archived(name, policy, scenarios) for name, policy in policies.items()]
 
-    def _archived(self, policy: GaussianPolicy, scenarios: Sequence[int]) -> ArchivedPolicy:
-        name = f"refined-{_weights_mark(policy)}"
-        return ArchivedPolicy(policy, [self._driven(policy, name, each) for each in scenarios])
+    def _archived(self, name: str, policy: GaussianPolicy, scenarios: Sequence[int]) -> ArchivedPolicy:
+        kept_as = f"refined-{_weights_mark(policy)}"
+        driven = [self._driven(policy, kept_as, each) for each in scenarios]
+        return ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name))
 
     def _reference(self, scenario: int) -> Trajectory:
         return self._driven(simulation.reference_policy(self.task), "reference", scenario)

@@ -14,7 +14,7 @@ from tests.benchmarks.archived_policies import MODE, tables
 from worker.__main__ import main
 from worker.compute import simulation
 from worker.domain.trajectory import Trajectory
-from worker.experiments import archive_policies
+from worker.experiments import archive_policies, fit_response_surface
 from worker.experiments.archive_policies import ARCHETYPES, Archetype
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
@@ -35,12 +35,15 @@ SHORT = Refinement(
 
 
 def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
+    request.addfinalizer(simulation.archived_policies.cache_clear)
     monkeypatch.setattr(simulation, "archive_folder", lambda task: tmp_path / "refined")
     monkeypatch.setattr(archive_policies, "POOL_SCENARIOS", 2)
     monkeypatch.setattr(archive_policies, "TEST_SCENARIOS", 1)
     monkeypatch.setattr(archive_policies, "LARGEST_LOSS", 1.0)
+    monkeypatch.setattr(archive_policies, "SCENARIOS_AROUND", fit_response_surface.BLOCK)
+    monkeypatch.setattr(fit_response_surface, "MODES_PER_SCENARIO", 1)
     began = list[int]()
 
     def noting(*asked: Any) -> tuple[FilterDraft, Sequence[Trajectory]]:
@@ -59,7 +62,12 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
     assert began == [0, 1, 2]
     assert sorted(file.stem for file in (tmp_path / "refined").glob("*.safetensors")) == ["even", "level"]
     assert json.loads((tmp_path / "refined" / "archive.json").read_text()) == record
-    assert not list((tmp_path / "work").glob("*-training")), "what a training needs to go on is cleared away"
+    left = [file.name for file in (tmp_path / "work").iterdir() if not file.name.endswith("-done")]
+    assert left == ["rollouts"], "what it needs to go on is cleared away"
+    for name in ("even", "level"):
+        around = simulation.surface_around("feeding", name)
+        assert around is not None
+        assert around.coefficients.any()
 
     with monkeypatch.context() as patched:
         patched.setattr(archive_policies, "refine", lambda *_: pytest.fail("it was trained again"))

@@ -10,11 +10,13 @@ import torch
 from tests.worker import invented
 from tests.worker.ml.test_methods import POLICY, REWARD, World, collect
 from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import Act
+from worker.domain.type_aliases import Act, FloatArray
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting import response_surface
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.gate import signal_changes, trial_of
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement import refinement
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
@@ -53,6 +55,10 @@ def reference() -> list[Trajectory]:
     return [replace(each, success=True) for each in collect(POLICY.mean, SCENARIOS, 0.0, 0)]
 
 
+def failing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+    return [replace(each, success=False) for each in collect(act, scenarios, noise, seed)]
+
+
 def succeeding(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
     return [replace(each, success=True) for each in collect(act, scenarios, noise, seed)]
 
@@ -65,25 +71,67 @@ def test_it_begins_as_what_the_person_wants_most_of_what_keeps_the_task(referenc
         moved(1.0),
     )
     others = [a_little, much, lost, archived(liked)]
-    start, driven = best_beginning(DISLIKES, NO_MODE, others, reference)
+    start, driven = best_beginning(DISLIKES, NO_MODE, others, [], reference, succeeding)
     assert start.weights.refined is much.policy.weights
     assert driven is much.driven
     likes = replace(DISLIKES, reward=StructuredReward(-REWARD.weights))
-    assert best_beginning(likes, NO_MODE, others, reference)[0].weights.refined is liked.weights
+    assert best_beginning(likes, NO_MODE, others, [], reference, succeeding)[0].weights.refined is liked.weights
+
+
+def explored(each: ArchivedPolicy) -> ArchivedPolicy:
+    """With a surface of the modes around it, fitted in other scenarios as it is when an archive is made."""
+    family, policy, scenarios = invented.TASK.modes, each.policy, range(200, 260)
+    modes, alone = family.sample(len(scenarios), np.random.default_rng(3)), collect(policy.mean, scenarios, 0.0, 0)
+    changed = [_in_mode(policy, mode, scenario) for mode, scenario in zip(modes, scenarios, strict=True)]
+    around = response_surface.fit(family, modes, signal_changes(alone, changed), np.ones(len(scenarios)))
+    return replace(each, around=around)
+
+
+def _in_mode(policy: GaussianPolicy, mode: FloatArray, scenario: int) -> Trajectory:
+    weights = FilterWeights(refined=policy.weights, refined_mode=invented.TASK.modes.named(mode))
+    return collect(act_of(invented.TASK.modes, POLICY, weights), [scenario], 0.0, 0)[0]
+
+
+def test_it_begins_as_an_archived_policy_in_the_mode_that_the_person_wants_it_in(reference: list[Trajectory]) -> None:
+    plain = archived(moved(-0.5))
+    start, driven = best_beginning(DISLIKES, NO_MODE, [plain, explored(plain)], [], reference, succeeding)
+    assert start.weights.refined is plain.policy.weights
+    assert start.weights.refined_mode
+    gained, alone = (trial_of(DISLIKES, 1.0, 0.0, reference, some).preference for some in (driven, plain.driven))
+    assert gained > 1.2 * alone
+    again = succeeding(act_of(invented.TASK.modes, POLICY, start.weights), SCENARIOS, 0.0, 0)
+    np.testing.assert_array_equal([each.actions for each in again], [each.actions for each in driven])
+
+
+def test_in_a_mode_that_loses_the_task_an_archived_policy_is_not_begun_as(reference: list[Trajectory]) -> None:
+    plain = archived(moved(-0.5))
+    start, driven = best_beginning(DISLIKES, NO_MODE, [explored(plain)], [], reference, failing)
+    assert start.weights.refined is plain.policy.weights
+    assert not start.weights.refined_mode
+    assert driven is plain.driven
+
+
+def test_what_was_learned_from_an_archived_policy_in_a_mode_is_executed_in_none(reference: list[Trajectory]) -> None:
+    start, driven = best_beginning(DISLIKES, NO_MODE, [explored(archived(moved(-0.5)))], [], reference, succeeding)
+    begun, *_ = refinement.refine(DISLIKES, start, Beginning(World, [], reference, reference, collect), ONLY_IMITATED)
+    assert not begun.weights.refined_mode
+    learned = collect(act_of(invented.TASK.modes, POLICY, begun.weights), SCENARIOS, 0.0, 0)
+    wanted, came, usual = (np.concatenate([each.actions for each in some]) for some in (driven, learned, reference))
+    assert np.abs(came - wanted).mean() < 0.5 * np.abs(usual - wanted).mean()
 
 
 def test_whose_own_mode_is_better_than_all_of_them_begins_as_that(reference: list[Trajectory]) -> None:
     trial = GateTrial(1.0, 0.0, 99.0, 0.0, 0.0)
     with_mode = FilterDraft(FilterWeights(mode={"speed_near": -0.3}), trials=(trial,))
-    assert best_beginning(DISLIKES, with_mode, [archived(moved(-1.0))], reference) == (with_mode, [])
-    assert best_beginning(DISLIKES, NO_MODE, [], reference) == (NO_MODE, [])
-    assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], reference) == (NO_MODE, [])
+    assert best_beginning(DISLIKES, with_mode, [archived(moved(-1.0))], [], reference, succeeding) == (with_mode, [])
+    assert best_beginning(DISLIKES, NO_MODE, [], [], reference, succeeding) == (NO_MODE, [])
+    assert best_beginning(DISLIKES, NO_MODE, [archived(moved(1.0))], [], reference, succeeding) == (NO_MODE, [])
 
 
 @pytest.mark.parametrize("mode", [NO_MODE, WEAK_MODE])
 def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajectory], mode: FilterDraft) -> None:
     policy = moved(-1.0)
-    start, _ = best_beginning(DISLIKES, mode, [archived(policy)], reference)
+    start, _ = best_beginning(DISLIKES, mode, [archived(policy)], [], reference, succeeding)
     beginning = Beginning(World, [], reference, reference, collect)
     begun, *_ = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
     seen = invented.observations(300, np.random.default_rng(9))
@@ -96,7 +144,7 @@ def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajec
 def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_better(
     reference: list[Trajectory], learned: float, is_own: bool
 ) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
     gated = gate_refined(DISLIKES, start, [own], reference, lambda: reference, succeeding)
     assert gated.weights.refined is (own if is_own else start).weights.refined
@@ -105,7 +153,7 @@ def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_b
 
 
 def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: list[Trajectory]) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     gated = gate_refined(DISLIKES, start, [], reference, lambda: reference, succeeding)
     assert gated.weights.refined is start.weights.refined
     none = gate_refined(DISLIKES, NO_MODE, [], reference, lambda: reference, succeeding)
@@ -116,7 +164,7 @@ def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: 
 def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(
     reference: list[Trajectory],
 ) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
 
     def failing_there(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -132,7 +180,7 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
     reference: list[Trajectory], lost_where: range, best_on_the_way: float, is_own: bool
 ) -> None:
     """Wherever that shows: in the gate's scenarios or in those of the check."""
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], reference)
+    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], [], reference, succeeding)
     last, best = (replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way))
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
 

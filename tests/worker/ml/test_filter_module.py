@@ -1,5 +1,6 @@
 """The action filter: identity where it must be, the same in NumPy, torch and ONNX, and learned within bounds."""
 
+import json
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -7,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load, save
 
 from tests.worker import invented
 from worker.domain.modes import ApproachModes
@@ -14,6 +16,7 @@ from worker.ml.filters.encoders.action_encoder import REACH, ResidualAdapter
 from worker.ml.filters.exported.filter_module import ActionFilter, FilterWeights, build, state_of
 from worker.ml.filters.exported.filter_onnx import ExportDiffers, OnnxFilter, largest_difference, to_onnx
 from worker.ml.policies.torch_module import FrozenPolicy
+from worker.ml.rewards.reward_models import stored_config
 
 POLICY = invented.small_policy()
 SEEN = invented.observations(40, np.random.default_rng(0))
@@ -84,6 +87,17 @@ def test_modes_in_torch_and_in_the_simulator_are_the_same(seed: int) -> None:
     np.testing.assert_allclose(filtered(FilterWeights(mode=FAMILY.named(mode))), expected, atol=1e-5)
 
 
+def test_a_refined_policy_is_executed_in_its_own_mode_and_not_in_the_one_that_the_frozen_policy_was_given() -> None:
+    refined = invented.small_policy(5)
+    alone, in_mode = FilterWeights(mode=MODE, refined=refined.weights), dict.fromkeys(FAMILY.names, 0.3)
+    np.testing.assert_allclose(filtered(alone), refined.mean(SEEN), atol=1e-6)
+    mode = np.full(len(FAMILY.axes), 0.3, np.float32)
+    expected = np.clip(FAMILY.executed(SEEN, mode, refined.mean(FAMILY.perceived(SEEN, mode))), -1, 1)
+    moved = filtered(alone.changed(refined_mode=in_mode))
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
+    assert np.abs(moved - filtered(alone)).max() > 0.05
+
+
 @pytest.fixture(scope="module")
 def exported() -> bytes:
     return to_onnx(build(FAMILY, POLICY, FilterWeights(mode=MODE, gate=0.7, encoder=adapter_state())), SEEN, MEANS)
@@ -140,6 +154,19 @@ def test_weights_survive_storage(encoder: dict[str, np.ndarray]) -> None:
     loaded = FilterWeights.from_bytes(weights.to_bytes())
     assert loaded.mode == pytest.approx(weights.mode)
     np.testing.assert_array_equal(filtered(loaded), filtered(weights))
+
+
+def test_a_refined_policy_and_its_mode_survive_storage() -> None:
+    weights = FilterWeights(mode=MODE, refined=invented.small_policy(5).weights, refined_mode={"speed_near": 0.4})
+    np.testing.assert_array_equal(filtered(FilterWeights.from_bytes(weights.to_bytes())), filtered(weights))
+
+
+def test_refined_filters_that_were_stored_before_these_had_a_mode_do_what_they_did() -> None:
+    weights = FilterWeights(mode=MODE, refined=invented.small_policy(5).weights)
+    config, tensors = stored_config(weights.to_bytes()), load(weights.to_bytes())
+    del config["refined_mode"]
+    earlier = save(tensors, metadata={"config": json.dumps(config)})
+    np.testing.assert_array_equal(filtered(FilterWeights.from_bytes(earlier)), filtered(weights))
 
 
 def test_a_mode_of_another_task_is_refused_by_the_names_of_its_axes() -> None:

@@ -173,11 +173,12 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     mode = mode_search.find_mode(early, setting.surface(), setting.pool, reference, setting.collect)
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
-        start, driven = best_beginning(early, mode, archived, reference)
+        known, collect = setting.pool.rollouts, setting.collect
+        start, driven = best_beginning(early, mode, archived, known, reference, collect)
         refinement.refine_ahead(early, start, replace(beginning, archived=driven), config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
-            start, driven = best_beginning(problem, draft, archived, reference)
+            start, driven = best_beginning(problem, draft, archived, known, reference, collect)
             drafts: tuple[FilterDraft, ...] = ()
             if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
                 drafts = refinement.refine(problem, start, replace(beginning, archived=driven), config, checkpoint)

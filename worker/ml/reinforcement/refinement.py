@@ -126,7 +126,7 @@ def refine(
 
 
 def _with(draft: FilterDraft, actor: Actor) -> FilterDraft:
-    return replace(draft, weights=draft.weights.changed(refined=actor.policy().weights))
+    return replace(draft, weights=draft.weights.changed(refined=actor.policy().weights, refined_mode={}))
 
 
 def is_promising(
@@ -212,7 +212,7 @@ def _train(
 
 
 def _begun_as(problem: FilterProblem, draft: FilterDraft) -> FilterAct:
-    """The mode at its strength, or the archived policy, which is whole however much the mode was weakened."""
+    """The mode at its strength, or the archived policy, which is whole however much that mode was weakened."""
     weights = draft.weights.changed(gate=1.0) if draft.weights.refined else draft.weights
     return act_of(problem.task.modes, problem.policy, weights)
 

@@ -116,5 +116,5 @@ def gate_refined(
             return draft.timed("gate_refined", started)
     whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}
     why = whys.get(True, "The refined policy was no better on held-out scenarios and is off.")
-    draft = replace(draft, weights=draft.weights.changed(refined={}), notes=(*draft.notes, why))
+    draft = replace(draft, weights=draft.weights.changed(refined={}, refined_mode={}), notes=(*draft.notes, why))
     return draft.timed("gate_refined", started)

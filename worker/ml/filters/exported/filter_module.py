@@ -45,6 +45,8 @@ class FilterWeights:
     """limits of the shield (shield.untried, then shield.limits_of); empty: there is none"""
     refined: Mapping[str, Float32Array] = field(default_factory=dict)
     """weights of the person's refined policy, which acts in place of mode and residual; empty: it was not refined"""
+    refined_mode: Mapping[str, float] = field(default_factory=dict)
+    """the mode in which the refined policy is executed; an axis that is not named is 0"""
 
     @property
     def moves_nothing(self) -> bool:
@@ -64,6 +66,7 @@ class FilterWeights:
             "kind": "action encoder",
             "method": self.method,
             "mode": dict(self.mode),
+            "refined_mode": dict(self.refined_mode),
             "residual_share": self.residual_share,
         }
         limits = {f"{_SHIELD}{name}": array for name, array in self.shield.items()}
@@ -73,18 +76,27 @@ class FilterWeights:
 
     @classmethod
     def from_bytes(cls, stored: bytes) -> Self:
-        """Read what to_bytes() wrote."""
+        """Read what to_bytes() wrote. Before there was a mode around refined policies these had none."""
         config = stored_config(stored)
         tensors = load(stored)
         limits, refined = (
             {name.removeprefix(part): tensors.pop(name) for name in [*tensors] if name.startswith(part)}
             for part in (_SHIELD, _REFINED)
         )
-        return cls(config["method"], config["mode"], config["gate"], config["residual_share"], tensors, limits, refined)
+        return cls(
+            method=config["method"],
+            mode=config["mode"],
+            gate=config["gate"],
+            residual_share=config["residual_share"],
+            encoder=tensors,
+            shield=limits,
+            refined=refined,
+            refined_mode=config.get("refined_mode", {}),
+        )
 
 
 class ModeTransform(nn.Module):
-    """The person's execution mode around the frozen policy, and the residual adapter around that."""
+    """An execution mode around the frozen policy or a refined one, and the residual adapter around that."""
 
     mode: Tensor
     residual_share: Tensor
@@ -145,19 +157,6 @@ class PrintedTransform(nn.Module):
     def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
         """(B, D), (B, 7) -> (B, 7)"""
         action: Tensor = self.encoder(observation, policy_mean)
-        return action
-
-
-class RefinedTransform(nn.Module):
-    """The person's refined policy in place of mode and residual (worker.ml.reinforcement.refinement)."""
-
-    def __init__(self, refined: FrozenPolicy) -> None:
-        super().__init__()
-        self.refined = refined
-
-    def forward(self, observation: Tensor, policy_mean: Tensor) -> Tensor:
-        """(B, D), (B, 7) -> (B, 7)"""
-        action: Tensor = self.refined(observation)[0]
         return action
 
 
@@ -224,7 +223,8 @@ def build(family: ModeFamily, policy: ReferencePolicy, weights: FilterWeights) -
         load_state(encoder, weights.encoder)
         transform = PrintedTransform(encoder)
     elif weights.refined:
-        transform = RefinedTransform(FrozenPolicy(weights.refined))
+        refined = FrozenPolicy(weights.refined)
+        transform = ModeTransform(family, refined, weights.refined_mode, None, residual_share=0.0)
     else:
         adapter = None
         if weights.encoder and weights.residual_share > 0.0:

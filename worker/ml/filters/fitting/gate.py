@@ -42,7 +42,7 @@ def trial_of(
     before, after = (problem.reward.member_returns(driven) for driven in (reference, filtered))
     outcomes = successes(filtered) - successes(reference)
     gains = np.average(after - before, axis=1, weights=_weights(outcomes))
-    unit = max(float(before.mean(axis=0).std()), 1e-9)
+    unit = spread_of(before)
     success = float(outcomes.mean())
     pressed = float(_pressed(problem, reference, filtered).mean())
     return GateTrial(
@@ -54,6 +54,11 @@ def trial_of(
         chance=chance_of_gain(gains),
         pressed=pressed,
     )
+
+
+def spread_of(returns: FloatArray) -> float:
+    """Standard deviation over scenarios of the members' mean of learned returns (E, N): what gains are counted in."""
+    return max(float(returns.mean(axis=0).std()), 1e-9)
 
 
 def _weights(outcomes: FloatArray) -> FloatArray:

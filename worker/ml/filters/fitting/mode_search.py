@@ -149,7 +149,7 @@ class _ModeSearch:
             surface,
             self.wishes,
             self.problem.seed,
-            caution=_caution(self.problem),
+            caution=caution_of(self.problem),
             success_caution=self.problem.config.success_caution * (1 + rejected),
             forces=self.forces,
             most_growth_n=self.problem.config.pressed_n,
@@ -180,7 +180,7 @@ def _further(problem: FilterProblem, wishes: FloatArray, pool: Pool) -> FurtherS
     return FurtherSurface.of_pool(problem.reward, wishes.mean(axis=0), pool, problem.task.modes)
 
 
-def _caution(problem: FilterProblem) -> float:
+def caution_of(problem: FilterProblem) -> float:
     """About what members disagree on: only where the reward model's prior has nobody whom the person may be like."""
     knows_people = isinstance(problem.reward, StructuredReward) and not problem.task.is_a_labs
     return 0.0 if knows_people else CAUTION
