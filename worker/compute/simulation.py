@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,6 @@ from worker.domain.scenarios import NORMALISATION
 from worker.domain.task import Task
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act, Float32Array
-from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.rewards.signal_predictor import SignalPredictor
@@ -34,6 +34,9 @@ from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.tasks.registry import checkpoint, environment_class, filmed_task, task
 from worker.whole_files import whole_files
+
+if TYPE_CHECKING:
+    from worker.ml.filters.fitting.response_surface import ResponseSurface
 
 REFERENCE_COUNT = 40
 
@@ -119,8 +122,12 @@ def surface_around_file(name: str, policy: str) -> Path:
     return archive_folder(name) / "around" / f"{policy}.safetensors"
 
 
-def surface_around(name: str, policy: str) -> ResponseSurface | None:
+def surface_around(name: str, policy: str) -> "ResponseSurface | None":
     """What modes change around an archived policy, beside that policy itself; None: they were not explored."""
+    from worker.ml.filters.fitting.response_surface import (
+        ResponseSurface,
+    )  # who fits nothing needs no scipy
+
     file, described = surface_around_file(name, policy), task(name)
     return ResponseSurface.load(file, described.modes, described.signals) if file.exists() else None
 

@@ -198,6 +198,7 @@ def _manifest(contents: BundleContents) -> dict[str, Any]:
         "gate": weights.gate,
         "residual_share": weights.residual_share if weights.encoder else 0.0,
         "refined": bool(weights.refined),
+        "refined_mode": dict(weights.refined_mode),
         "shield": _shield(contents),
         "reward_kind": contents.reward.kind,
         "signals": list(contents.task.signals),
