@@ -161,7 +161,7 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
 
 
 class Episodes(AtHand):
-    """Episodes of noise, and how many were driven by whom."""
+    """Episodes of noise, and how many were driven by which policy or filter."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -170,7 +170,7 @@ class Episodes(AtHand):
     def run_all(self, lane: Lane, beat: Callable[[], None], function: Any, arguments: list[tuple[Any, ...]]) -> Any:
         """See Compute."""
         for _, act, scenarios, *_ in arguments:
-            self.driven[act.__self__] += len(scenarios)
+            self.driven[getattr(act, "__self__", act)] += len(scenarios)
         return [[AtHome.episode(scenario) for scenario in scenarios] for _, _, scenarios, *_ in arguments]
 
 
