@@ -124,9 +124,8 @@ def surface_around_file(name: str, policy: str) -> Path:
 
 def surface_around(name: str, policy: str) -> "ResponseSurface | None":
     """What modes change around an archived policy, beside that policy itself; None: they were not explored."""
-    from worker.ml.filters.fitting.response_surface import (
-        ResponseSurface,
-    )  # who fits nothing needs no scipy
+    # processes that fit nothing do without scipy
+    from worker.ml.filters.fitting.response_surface import ResponseSurface
 
     file, described = surface_around_file(name, policy), task(name)
     return ResponseSurface.load(file, described.modes, described.signals) if file.exists() else None

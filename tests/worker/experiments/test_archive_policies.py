@@ -105,7 +105,12 @@ def test_an_archive_ships_with_the_policies_that_its_record_names(task: str) -> 
     assert made_for <= {(each.signal, each.sign) for each in ARCHETYPES}
     assert record["steps"] == Refinement().steps == usual_refinement_steps(task)
     reference = simulation.reference_policy(task)
-    for policy in shipped.values():
+    around = [file.stem for file in simulation.surface_around_file(task, "even").parent.iterdir()]
+    assert sorted(around) == sorted(shipped), "modes were explored around each, and around nothing else"
+    for name, policy in shipped.items():
+        surface = simulation.surface_around(task, name)
+        assert surface is not None
+        assert surface.coefficients.any()
         assert isinstance(policy, GaussianPolicy)
         assert policy.offset.tolist() == reference.weights["offset"].tolist()
         assert policy.action_size == reference.action_size
