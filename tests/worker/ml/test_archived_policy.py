@@ -19,7 +19,7 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import signal_changes, trial_of
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement import refinement
-from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.archived_policy import TRIED_IN_MODES, ArchivedPolicy, best_beginning
 from worker.ml.reinforcement.refinement import Beginning, Refinement
 from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.reward_models import StructuredReward
@@ -109,6 +109,48 @@ def test_in_a_mode_that_loses_the_task_an_archived_policy_is_not_begun_as(refere
     assert start.weights.refined is plain.policy.weights
     assert not start.weights.refined_mode
     assert driven is plain.driven
+
+
+def test_whose_best_mode_loses_the_task_begins_in_a_lesser_one_that_keeps_it(reference: list[Trajectory]) -> None:
+    plain, tried = explored(archived(moved(-0.5))), list[float]()
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """Whoever goes as far as the first loses the task."""
+        driven = collect(act, scenarios, noise, seed)
+        tried.append(float(np.mean([each.actions[:, 0].mean() for each in driven])))
+        return [replace(each, success=tried[-1] > tried[0]) for each in driven]
+
+    start, driven = best_beginning(DISLIKES, NO_MODE, [plain], [], reference, drive)
+    assert start.weights.refined_mode
+    assert all(each.success for each in driven)
+    alone, gained = (trial_of(DISLIKES, 1.0, 0.0, reference, some).preference for some in (plain.driven, driven))
+    assert gained > alone
+
+
+def test_the_most_promising_is_tried_first_and_no_more_than_somebody_can_wait_for(reference: list[Trajectory]) -> None:
+    others, tried = [explored(archived(moved(by))) for by in (-0.4, *[-0.5] * TRIED_IN_MODES)], list[float]()
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        driven = failing(act, scenarios, noise, seed)
+        tried.append(float(np.mean([each.actions[:, 0].mean() for each in driven])))
+        return driven
+
+    best_beginning(DISLIKES, NO_MODE, others, [], reference, drive)
+    assert len(tried) == TRIED_IN_MODES
+    assert tried[0] == min(tried)
+
+
+def test_a_policy_that_loses_the_task_is_not_driven_once_more_where_no_mode_is_better(
+    reference: list[Trajectory],
+) -> None:
+    lost = explored(archived(moved(-0.5), success=False))
+    assert lost.around
+    flat = replace(lost.around, coefficients=np.zeros_like(lost.around.coefficients))
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        pytest.fail("It was driven again.")
+
+    assert best_beginning(DISLIKES, NO_MODE, [replace(lost, around=flat)], [], reference, drive) == (NO_MODE, [])
 
 
 def test_what_was_learned_from_an_archived_policy_in_a_mode_is_executed_in_none(reference: list[Trajectory]) -> None:

@@ -10,18 +10,29 @@ surface around that policy foresees (decision 197).
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from worker.domain.trajectory import Trajectory
-from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.domain.type_aliases import FloatArray
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
-from worker.ml.filters.fitting.gate import keeps_task, spread_of, to_beat, trial_of
+from worker.ml.filters.fitting.gate import (
+    keeps_task,
+    largest_forces,
+    signal_changes,
+    spread_of,
+    successes,
+    to_beat,
+    trial_of,
+)
+from worker.ml.filters.fitting.mode_archive import tail_growth_n
 from worker.ml.filters.fitting.mode_search import caution_of
 from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.refinement_gate import try_refined
 
-TRIED_IN_MODES = 3
-"""policies, those with which most is foreseen: each is a drive through the gate's scenarios"""
+TRIED_IN_MODES = 5
+"""each is a drive through the gate's scenarios"""
 
 
 @dataclass(frozen=True)
@@ -34,14 +45,6 @@ class ArchivedPolicy:
     """of modes in which it is executed, beside itself; None: they were not explored"""
 
 
-@dataclass(frozen=True)
-class _Foreseen:
-    """An archived policy in the mode that is best for somebody."""
-
-    preference: float
-    weights: FilterWeights
-
-
 def best_beginning(
     problem: FilterProblem,
     draft: FilterDraft,
@@ -52,48 +55,77 @@ def best_beginning(
 ) -> tuple[FilterDraft, Sequence[Trajectory]]:
     """The draft with the archived policy that the reward model likes best, or as it is where its mode is better yet.
 
-    Those with which most is foreseen are tried in the modes that are best for this person, too. Also returns what the
-    policy does in the gate's scenarios, nothing where it is the mode. ``known``: rollouts of many behaviours;
-    ``reference``: of the frozen policy in the gate's scenarios.
+    Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
+    Every trial says more of the modes around its policy, where another may be sought; who lost the task there is more
+    careful with it. Also returns what the policy does in the gate's scenarios, nothing where it is the mode.
+    ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios.
     """
     best, most = draft, to_beat(problem, draft, reference)
     driven: Sequence[Trajectory] = []
-    trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
-    for each, trial in zip(archived, trials, strict=True):
+    explored = []
+    wishes, unit = problem.reward.signal_weights(known), spread_of(problem.reward.member_returns(reference))
+    for each in archived:
+        trial = trial_of(problem, 1.0, 0.0, reference, each.driven)
         if trial.preference > most and keeps_task(problem, trial, reference):
             best = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
             driven, most = each.driven, trial.preference
-    foreseen = [
-        _in_best_mode(problem, draft, each.policy, each.around, trial.preference, known, reference)
-        for each, trial in zip(archived, trials, strict=True)
-        if each.around is not None
-    ]
-    for some in sorted(foreseen, key=_preference, reverse=True)[:TRIED_IN_MODES]:
-        if some.preference > most:
-            candidate = replace(draft, weights=some.weights)
-            trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
-            if trial.preference > most and keeps_task(problem, trial, reference):
-                best, driven, most = candidate, tried, trial.preference
+        if each.around is not None:
+            explored.append(_InModes(problem, each, each.around, trial.preference, wishes / unit))
+    for _ in range(TRIED_IN_MODES if explored else 0):
+        some = max(explored, key=_foreseen)
+        if some.foreseen <= most:
+            break
+        mode = problem.task.modes.named(some.mode)
+        weights = draft.weights.changed(refined=some.archived.policy.weights, refined_mode=mode)
+        candidate = replace(draft, weights=weights)
+        trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
+        is_kept = keeps_task(problem, trial, reference)
+        if trial.preference > most and is_kept:
+            best, driven, most = candidate, tried, trial.preference
+        some.observe(reference, tried, is_kept=is_kept)
     return best, driven
 
 
-def _preference(foreseen: _Foreseen) -> float:
-    return foreseen.preference
+class _InModes:
+    """An archived policy, and which mode is best for it by all that is known of those around it."""
+
+    def __init__(
+        self,
+        problem: FilterProblem,
+        archived: ArchivedPolicy,
+        around: ResponseSurface,
+        alone: float,
+        wishes: FloatArray,
+    ) -> None:
+        """``alone``: preference of the trial of the policy as it is; ``wishes``: (E, S) in the same unit."""
+        self.problem, self.archived, self.alone, self.wishes = problem, archived, alone, wishes
+        self.surface, self.forces, self.lost = around, around.forces, 0
+        self._seek()
+
+    def observe(self, reference: Sequence[Trajectory], driven: Sequence[Trajectory], *, is_kept: bool) -> None:
+        """Learn from what came of the mode in the gate's scenarios, and seek another."""
+        changes = signal_changes(self.archived.driven, driven)
+        self.surface = self.surface.with_observed(self.mode, changes, successes(driven))
+        growth_n = tail_growth_n(largest_forces(driven) - largest_forces(reference))
+        self.forces = self.forces.with_observed(self.mode, float(growth_n))
+        self.lost += not is_kept
+        self._seek()
+
+    def _seek(self) -> None:
+        config = self.problem.config
+        self.mode = best_mode(
+            self.surface,
+            self.wishes,
+            self.problem.seed,
+            caution=caution_of(self.problem),
+            success_caution=config.success_caution * (1 + self.lost),
+            forces=self.forces,
+            most_growth_n=config.pressed_n,
+        )
+        is_new = self.mode.any() and not any(np.array_equal(self.mode, tried) for tried in self.forces.modes)
+        gained = float(self.surface.predict(self.mode)[0] @ self.wishes.mean(axis=0))
+        self.foreseen = self.alone + gained if is_new else -np.inf
 
 
-def _in_best_mode(
-    problem: FilterProblem,
-    draft: FilterDraft,
-    policy: GaussianPolicy,
-    around: ResponseSurface,
-    alone: float,
-    known: Sequence[Trajectory],
-    reference: Sequence[Trajectory],
-) -> _Foreseen:
-    """``alone``: preference of the trial of the policy as it is."""
-    wishes, unit = problem.reward.signal_weights(known), spread_of(problem.reward.member_returns(reference))
-    caution, success_caution = caution_of(problem), problem.config.success_caution
-    mode = best_mode(around, wishes, problem.seed, caution=caution, success_caution=success_caution)
-    changes, _ = around.predict(mode)
-    weights = draft.weights.changed(refined=policy.weights, refined_mode=problem.task.modes.named(mode))
-    return _Foreseen(alone + float(changes @ wishes.mean(axis=0)) / unit, weights)
+def _foreseen(some: _InModes) -> float:
+    return some.foreseen
