@@ -87,15 +87,16 @@ class InModes:
         self.drives, began = 0, time.perf_counter()
         in_mode, _ = best_beginning(problem, mode, self.archived, [], self.gate_reference, self._collect)
         took, drives = time.perf_counter() - began, self.drives
+        is_same = not in_mode.weights.refined_mode  # else both begin as the best of the same
         before = self._driven(start.weights, wish)
-        after = before if in_mode == start else self._driven(in_mode.weights, wish)
+        after = before if is_same else self._driven(in_mode.weights, wish)
         return {
             "task": self.task,
             "group": group,
             "user": user,
             **{f"{key}_alone": value for key, value in before.items()},
             **{f"{key}_in_modes": value for key, value in after.items()},
-            "changed": int(in_mode != start),
+            "changed": int(not is_same),
             "mode": " ".join(f"{key}={value:.3f}" for key, value in in_mode.weights.refined_mode.items()),
             "drives": drives,
             "seconds": round(took, 1),
