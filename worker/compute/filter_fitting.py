@@ -121,8 +121,9 @@ class FilterFit:
             drafts = train(partial(refining.train, training, begun)) or ()
             if not drafts:
                 return None
-        start, reference = training.draft, training.reference
-        return gate_refined(self.problem, start, drafts, reference, self._check_reference, self.collect, self.progress)
+        start, archived, reference = training.draft, training.archived, training.reference
+        more_reference, progress = self._check_reference, self.progress
+        return gate_refined(self.problem, start, archived, drafts, reference, more_reference, self.collect, progress)
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
         self.progress("checking what the refinement has come to", 0.34)

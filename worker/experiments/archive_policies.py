@@ -212,7 +212,7 @@ class _Making:
         beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, archived)
         drafts = refine(problem, start, beginning, self.config, Checkpoint(folder))
         check = partial(reference, config.check_block(self.task))
-        gated = gate_refined(problem, start, drafts, gate, check, self._collect)
+        gated = gate_refined(problem, start, archived, drafts, gate, check, self._collect)
         shutil.rmtree(folder)
         weights = gated.weights
         is_new = weights.gate == 1.0 and weights.refined is not start.weights.refined

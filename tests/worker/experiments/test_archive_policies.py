@@ -50,7 +50,9 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
         began.append(len(asked[2]))
         return best_beginning(*asked)
 
-    def passing(problem: FilterProblem, start: FilterDraft, drafts: Sequence[FilterDraft], *_: Any) -> FilterDraft:
+    def passing(
+        problem: FilterProblem, start: FilterDraft, driven: Any, drafts: Sequence[FilterDraft], *_: Any
+    ) -> FilterDraft:
         """So short a training makes nothing that the gate would let through."""
         return replace(drafts[0], weights=drafts[0].weights.changed(gate=0.8 if len(began) == 3 else 1.0))
 

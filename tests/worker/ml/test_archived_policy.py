@@ -186,33 +186,47 @@ def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajec
 def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_better(
     reference: list[Trajectory], learned: float, is_own: bool
 ) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    start, driven = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
-    gated = gate_refined(DISLIKES, start, [own], reference, lambda: reference, succeeding)
+    gated = gate_refined(DISLIKES, start, driven, [own], reference, lambda: reference, succeeding)
     assert gated.weights.refined is (own if is_own else start).weights.refined
     assert ("found none better for this person" in gated.notes[-1]) != is_own
     assert gated.tested
 
 
 def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: list[Trajectory]) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
-    gated = gate_refined(DISLIKES, start, [], reference, lambda: reference, succeeding)
+    start, driven = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: reference, succeeding)
     assert gated.weights.refined is start.weights.refined
-    none = gate_refined(DISLIKES, NO_MODE, [], reference, lambda: reference, succeeding)
+    none = gate_refined(DISLIKES, NO_MODE, [], [], reference, lambda: reference, succeeding)
     assert not none.weights.refined
     assert "given up" in none.notes[-1]
+
+
+def test_nobody_waits_for_what_the_archived_policy_does_in_scenarios_that_it_was_tried_in(
+    reference: list[Trajectory],
+) -> None:
+    start, driven = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    more, asked = [replace(each, scenario=each.scenario + 100) for each in reference], list[int]()
+
+    def noting(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        asked.extend(scenarios)
+        return succeeding(act, scenarios, noise, seed)
+
+    gate_refined(DISLIKES, start, driven, [], reference, lambda: more, noting)
+    assert asked == [each.scenario for each in more]
 
 
 def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(
     reference: list[Trajectory],
 ) -> None:
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    start, driven = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
 
     def failing_there(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=each.scenario < 100) for each in succeeding(act, scenarios, noise, seed)]
 
-    gated = gate_refined(DISLIKES, start, [], reference, lambda: more, failing_there)
+    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: more, failing_there)
     assert gated.weights == NO_MODE.weights
 
 
@@ -222,7 +236,7 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
     reference: list[Trajectory], lost_where: range, best_on_the_way: float, is_own: bool
 ) -> None:
     """Wherever that shows: in the gate's scenarios or in those of the check."""
-    start, _ = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], [], reference, succeeding)
+    start, driven = best_beginning(DISLIKES, NO_MODE, [archived(moved(-1.2))], [], reference, succeeding)
     last, best = (replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way))
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
 
@@ -232,6 +246,6 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
         far = [each.actions[:, 0].mean() < FAR and each.scenario in lost_where for each in driven]
         return [replace(each, success=not is_far) for each, is_far in zip(driven, far, strict=True)]
 
-    gated = gate_refined(DISLIKES, start, [last, best], reference, lambda: more, drive)
+    gated = gate_refined(DISLIKES, start, driven, [last, best], reference, lambda: more, drive)
     assert gated.weights.gate == 1.0
     assert gated.weights.refined is (best if is_own else start).weights.refined

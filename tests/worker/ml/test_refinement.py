@@ -74,7 +74,7 @@ def gate_refined(
     """Checked in scenarios that the gate does not have, where the frozen policy is as good as in these."""
     driven = collect(POLICY.mean, CHECKED, 0.0, 0)
     checked = [replace(each, success=reference[0].success) for each in driven]
-    return refinement_gate.gate_refined(problem, FilterDraft(GATED), drafts, reference, lambda: checked, drive)
+    return refinement_gate.gate_refined(problem, FilterDraft(GATED), [], drafts, reference, lambda: checked, drive)
 
 
 def weights_of(drafts: Sequence[FilterDraft]) -> list[bytes]:
@@ -308,7 +308,7 @@ def test_where_the_whole_last_policy_loses_the_task_whatever_gains_most_is_next(
 
     strict = replace(problem(), config=FilterConfig(success_tolerance=0.05))
     succeeding = [replace(each, success=True) for each in reference]
-    gated = refinement_gate.gate_refined(strict, FilterDraft(GATED), watched, succeeding, lambda: succeeding, later)
+    gated = refinement_gate.gate_refined(strict, FilterDraft(GATED), [], watched, succeeding, lambda: succeeding, later)
     *tried, checked = gated.trials
     assert [trial.success_change < -0.5 for trial in tried] == [True] * lost + [False] * (6 - lost if lost else 1)
     chances = [each.weights.changed(gate=gate) for each in watched for gate in refinement_gate.STRENGTHS]

@@ -182,7 +182,7 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
             drafts: tuple[FilterDraft, ...] = ()
             if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
                 drafts = refinement.refine(problem, start, replace(beginning, archived=driven), config, checkpoint)
-            return gate_refined(problem, start, drafts, reference, more_reference, setting.collect)
+            return gate_refined(problem, start, driven, drafts, reference, more_reference, setting.collect)
 
         return _shipped(setting, _fitted(setting, refined))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.ml.filters.fitting.filter_draft import FilterDraft
+from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 from worker.ml.filters.fitting.gate import (
     keeps_task,
@@ -62,15 +62,12 @@ def best_beginning(
     """
     best, most = draft, to_beat(problem, draft, reference)
     driven: Sequence[Trajectory] = []
-    explored = []
-    wishes, unit = problem.reward.signal_weights(known), spread_of(problem.reward.member_returns(reference))
-    for each in archived:
-        trial = trial_of(problem, 1.0, 0.0, reference, each.driven)
+    trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
+    for each, trial in zip(archived, trials, strict=True):
         if trial.preference > most and keeps_task(problem, trial, reference):
             best = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
             driven, most = each.driven, trial.preference
-        if each.around is not None:
-            explored.append(_InModes(problem, each, each.around, trial.preference, wishes / unit))
+    explored = _in_modes(problem, archived, trials, known, reference)
     for _ in range(TRIED_IN_MODES if explored else 0):
         some = max(explored, key=_foreseen)
         if some.foreseen <= most:
@@ -84,6 +81,24 @@ def best_beginning(
             best, driven, most = candidate, tried, trial.preference
         some.observe(reference, tried, is_kept=is_kept)
     return best, driven
+
+
+def _in_modes(
+    problem: FilterProblem,
+    archived: Sequence[ArchivedPolicy],
+    trials: Sequence[GateTrial],
+    known: Sequence[Trajectory],
+    reference: Sequence[Trajectory],
+) -> list["_InModes"]:
+    """Those whose modes were explored."""
+    if all(each.around is None for each in archived):
+        return []
+    wishes = problem.reward.signal_weights(known) / spread_of(problem.reward.member_returns(reference))
+    return [
+        _InModes(problem, each, each.around, trial.preference, wishes)
+        for each, trial in zip(archived, trials, strict=True)
+        if each.around is not None
+    ]
 
 
 class _InModes:

@@ -10,7 +10,7 @@ from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import keeps_task, to_beat, try_on
+from worker.ml.filters.fitting.gate import keeps_task, to_beat, trial_of, try_on
 
 _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
@@ -62,6 +62,7 @@ def try_refined(
 def gate_refined(
     problem: FilterProblem,
     start: FilterDraft,
+    archived: Sequence[Trajectory],
     drafts: Sequence[FilterDraft],
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
@@ -71,16 +72,17 @@ def gate_refined(
     """As much of a refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
 
     ``start``: with the archived policy that was the best beginning, which is one of those to choose from, or with the
-    mode alone; ``drafts``: of refine(), none where that was given up. The whole last policy, which is mostly it, and
-    the archived one are tried first; if the better of them will not do, less of them and what had been best on the way
-    are, too, and what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check,
-    which what passes the gate is tried in, too.
+    mode alone; ``archived``: what that policy does in the gate's scenarios, none of a mode; ``drafts``: of refine(),
+    none where that was given up. The whole last policy and the archived one are tried first; if
+    the better of them will not do, less of them and what had been best on the way are, too, and what gains most comes
+    first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in,
+    too.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
     least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
-    archived = [start] if start.weights.refined else []
-    at_first = [(each, STRENGTHS[0]) for each in (*drafts[:1], *archived)]
-    later = [(each, gate) for gate, each in product(STRENGTHS[1:], (*drafts[:1], *archived))]
+    tried_first = (*drafts[:1], *([start] if start.weights.refined else []))
+    at_first = [(each, STRENGTHS[0]) for each in tried_first]
+    later = [(each, gate) for gate, each in product(STRENGTHS[1:], tried_first)]
     later += [(each, gate) for each, gate in product(drafts[1:], STRENGTHS)]
 
     def passing(tries: Sequence[tuple[FilterDraft, float]]) -> list[_Passing]:
@@ -88,7 +90,10 @@ def gate_refined(
         found = []
         for candidate, gate in tries:
             progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-            trial, driven = try_refined(problem, candidate, gate, reference, collect)
+            if candidate is start and gate == STRENGTHS[0]:
+                trial, driven = replace(trial_of(problem, gate, 0.0, reference, archived), refined=True), archived
+            else:
+                trial, driven = try_refined(problem, candidate, gate, reference, collect)
             draft = replace(draft, trials=(*draft.trials, trial))
             if trial.preference > least and keeps_task(problem, trial, reference):
                 if trial.chance is None or trial.chance >= SURE:
