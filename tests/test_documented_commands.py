@@ -105,6 +105,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker start-posture": "--restarts 50",
     "advice_to_stop": ROLLOUTS,
     "archived_policies": ROLLOUTS,
+    "policies_in_modes": ROLLOUTS,
     "backups": Elsewhere(
         "tests/app/test_backup_drill.py::"
         "test_a_restored_studio_has_every_answer_that_was_acknowledged_before_the_backup_began"
