@@ -230,6 +230,26 @@ def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_fil
     assert gated.weights == NO_MODE.weights
 
 
+def test_an_archived_policy_that_loses_the_task_in_its_mode_is_the_filter_in_none(reference: list[Trajectory]) -> None:
+    plain = explored(archived(moved(-0.5)))
+    start, driven = best_beginning(DISLIKES, NO_MODE, [plain], [], reference, succeeding)
+    assert start.weights.refined_mode
+    more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
+    far = 0.002 - np.mean([each.actions[:, 0].mean() for each in collect(plain.policy.mean, CHECKED, 0.0, 0)])
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """Whoever goes a little further than the policy alone loses the task in more scenarios."""
+        driven = collect(act, scenarios, noise, seed)
+        is_kept = scenarios[0] not in CHECKED or np.mean([each.actions[:, 0].mean() for each in driven]) >= -far
+        return [replace(each, success=bool(is_kept)) for each in driven]
+
+    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: more, drive)
+    assert gated.weights.refined is plain.policy.weights
+    assert not gated.weights.refined_mode
+    assert gated.weights.gate == 1.0
+    assert "refined beforehand" in gated.notes[-1]
+
+
 @pytest.mark.parametrize(("best_on_the_way", "is_own"), [(-1.4, True), (-0.8, False)])
 @pytest.mark.parametrize("lost_where", [SCENARIOS, CHECKED])
 def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_the_filter(

@@ -73,16 +73,18 @@ def gate_refined(
 
     ``start``: with the archived policy that was the best beginning, which is one of those to choose from, or with the
     mode alone; ``archived``: what that policy does in the gate's scenarios, none of a mode; ``drafts``: of refine(),
-    none where that was given up. The whole last policy and the archived one are tried first; if
-    the better of them will not do, less of them and what had been best on the way are, too, and what gains most comes
-    first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is tried in,
-    too.
+    none where that was given up. The whole last policy and the archived one are tried first; if the better of them will
+    not do, less of them, what had been best on the way and the archived policy in no mode are, too, and what gains most
+    comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is
+    tried in, too.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
     least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
     tried_first = (*drafts[:1], *([start] if start.weights.refined else []))
     at_first = [(each, STRENGTHS[0]) for each in tried_first]
-    later = [(each, gate) for gate, each in product(STRENGTHS[1:], tried_first)]
+    in_no_mode = replace(start, weights=start.weights.changed(refined_mode={}))
+    later = [(in_no_mode, STRENGTHS[0])] if start.weights.refined_mode else []
+    later += [(each, gate) for gate, each in product(STRENGTHS[1:], tried_first)]
     later += [(each, gate) for each, gate in product(drafts[1:], STRENGTHS)]
 
     def passing(tries: Sequence[tuple[FilterDraft, float]]) -> list[_Passing]:
@@ -116,7 +118,7 @@ def gate_refined(
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
             weights = each.draft.weights.changed(gate=each.gate)
             tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
-            note = _AS_IT_BEGAN if each.draft is start else _REFINED
+            note = _REFINED if any(each.draft is learned for learned in drafts) else _AS_IT_BEGAN
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, note))
             return draft.timed("gate_refined", started)
     whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}
