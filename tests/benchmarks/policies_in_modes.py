@@ -22,6 +22,7 @@ from tqdm import tqdm
 from app.installed_tasks import catalogue
 from tests.benchmarks import answering, result_tables
 from tests.benchmarks.few_answers import DRIVEN, FewAnswers, Wish
+from tests.benchmarks.few_answers_report import GROUPS
 from worker.analysis.comparison import result_pages
 from worker.analysis.study.statistics import mean_interval
 from worker.compute import learning, simulation
@@ -47,7 +48,7 @@ def main() -> None:
     """See the module."""
     told = answering.parser(__doc__, "policies_in_modes", seeds=0)
     told.add_argument("--people", type=int, default=12, help="drawn, and as many outside")
-    told.add_argument("--tasks", nargs="*", default=list(catalogue.names()))
+    told.add_argument("--tasks", nargs="*", choices=catalogue.names(), default=list(catalogue.names()))
     options = told.parse_args()
     torch.set_num_threads(1)
     table, page = options.output.with_suffix(".csv"), options.output.with_suffix(".md")
@@ -137,7 +138,9 @@ _HEAD = (
 
 
 def _lines(rows: Sequence[Row]) -> Iterator[str]:
-    for (task, group), grouped in groupby(rows, lambda row: (row["task"], row["group"])):
+    names, groups = list(catalogue.names()), list(GROUPS)
+    in_order = sorted(rows, key=lambda row: (names.index(row["task"]), groups.index(row["group"])))
+    for (task, group), grouped in groupby(in_order, lambda row: (row["task"], row["group"])):
         some = list(grouped)
         alone, in_modes = _column(some, "gain_percent_alone"), _column(some, "gain_percent_in_modes")
         yield (
