@@ -127,6 +127,19 @@ def test_whose_best_mode_loses_the_task_begins_in_a_lesser_one_that_keeps_it(ref
     assert gained > alone
 
 
+def test_a_mode_that_loses_anything_is_not_begun_in_however_much_of_it_is_tolerated(
+    reference: list[Trajectory],
+) -> None:
+    plain, tolerant = explored(archived(moved(-0.5))), replace(DISLIKES, config=FilterConfig(success_tolerance=0.3))
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        return [replace(each, success=each.scenario > 0) for each in collect(act, scenarios, noise, seed)]
+
+    start, _ = best_beginning(tolerant, NO_MODE, [plain], [], reference, drive)
+    assert start.weights.refined is plain.policy.weights
+    assert not start.weights.refined_mode
+
+
 def test_the_most_promising_is_tried_first_and_no_more_than_somebody_can_wait_for(reference: list[Trajectory]) -> None:
     others, tried = [explored(archived(moved(by))) for by in (-0.4, *[-0.5] * TRIED_IN_MODES)], list[float]()
 

@@ -19,6 +19,7 @@ from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 from worker.ml.filters.fitting.gate import (
     keeps_task,
     largest_forces,
+    loses_nothing,
     signal_changes,
     spread_of,
     successes,
@@ -56,9 +57,10 @@ def best_beginning(
     """The draft with the archived policy that the reward model likes best, or as it is where its mode is better yet.
 
     Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
-    Every trial says more of the modes around its policy, where another may be sought; who lost the task there is more
-    careful with it. Also returns what the policy does in the gate's scenarios, nothing where it is the mode.
-    ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios.
+    Every trial says more of the modes around its policy, where another may be sought; where anything is lost, another
+    is sought more carefully, as the best of several tries is the luckiest, too. Also returns what the policy does in
+    the gate's scenarios, nothing where it is the mode. ``known``: rollouts of many behaviours; ``reference``: of the
+    frozen policy in the gate's scenarios.
     """
     best, most = draft, to_beat(problem, draft, reference)
     driven: Sequence[Trajectory] = []
@@ -76,7 +78,7 @@ def best_beginning(
         weights = draft.weights.changed(refined=some.archived.policy.weights, refined_mode=mode)
         candidate = replace(draft, weights=weights)
         trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
-        is_kept = keeps_task(problem, trial, reference)
+        is_kept = loses_nothing(trial) and keeps_task(problem, trial, reference)
         if trial.preference > most and is_kept:
             best, driven, most = candidate, tried, trial.preference
         some.observe(reference, tried, is_kept=is_kept)
