@@ -8,11 +8,11 @@ from pathlib import Path
 from worker.compute import simulation
 from worker.compute.behaviours import Behaviour
 from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy
-from worker.sim.rollout import rollout
 from worker.tasks import registry
 from worker.whole_files import written_whole
 
@@ -47,29 +47,27 @@ class RolloutCache:
         return [self._archived(name, policy, scenarios) for name, policy in policies.items()]
 
     def _archived(self, name: str, policy: GaussianPolicy, scenarios: Sequence[int]) -> ArchivedPolicy:
-        kept_as = f"refined-{_weights_mark(policy)}"
-        driven = [self._driven(policy, kept_as, each) for each in scenarios]
+        kept_as = f"archived-{_weights_mark(policy)}"
+        driven = [self._driven(policy.mean, f"{kept_as}-{each}", each) for each in scenarios]
         return ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name))
 
     def _reference(self, scenario: int) -> Trajectory:
-        return self._driven(simulation.reference_policy(self.task), "reference", scenario)
-
-    def _driven(self, policy: ReferencePolicy, name: str, scenario: int) -> Trajectory:
-        path = self.directory / f"{name}-{scenario}.npz"
-        if path.exists():
-            return _load(path)
-        return _kept(rollout(simulation.environment(self.task), policy.mean, scenario), path)
+        return self._driven(simulation.reference_policy(self.task).mean, f"reference-{scenario}", scenario)
 
     def _behaviours(self, scenario: int) -> list[Trajectory]:
         drawn = simulation.behaviours(self.task, scenario, BEHAVIOURS_PER_SCENARIO)
         return [self._behaviour(scenario, index, behaviour) for index, behaviour in enumerate(drawn)]
 
     def _behaviour(self, scenario: int, index: int, behaviour: Behaviour) -> Trajectory:
-        path = self.directory / f"behaviour-{scenario}-{index}.npz"
-        if path.exists():
-            return _load(path)
-        act, reference = simulation.act_as(self.task, behaviour), simulation.reference_policy(self.task).mean
-        return _kept(rollout(simulation.environment(self.task), act, scenario, reference), path)
+        return self._driven(simulation.act_as(self.task, behaviour), f"behaviour-{scenario}-{index}", scenario)
+
+    def _driven(self, act: Act, kept_as: str, scenario: int) -> Trajectory:
+        path = self.directory / f"{kept_as}.npz"
+        if not path.exists():
+            driven = simulation.run_episode(self.task, act, scenario)
+            with written_whole(path) as draft:
+                driven.save(draft)
+        return _load(path)
 
 
 def policy_mark(task: str) -> str:
@@ -88,9 +86,3 @@ def _weights_mark(policy: ReferencePolicy, before: bytes = b"") -> str:
 @lru_cache(maxsize=2_000)
 def _load(path: Path) -> Trajectory:
     return Trajectory.load(path)
-
-
-def _kept(trajectory: Trajectory, path: Path) -> Trajectory:
-    with written_whole(path) as draft:
-        trajectory.save(draft)
-    return trajectory
