@@ -36,7 +36,7 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import largest_forces, signal_changes, successes
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.pool import Pool
-from worker.ml.reinforcement.archived_policy import best_beginning
+from worker.ml.reinforcement.archived_policy import best_archived
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.tasks import registry
 
@@ -84,9 +84,9 @@ class InModes:
         problem = FilterProblem(registry.task(self.task), simulation.reference_policy(self.task), reward, 0)
         mode = find_mode(problem, self.people.surface, Pool(), self.gate_reference, self._collect)
         alone = [replace(each, around=None) for each in self.archived]
-        start, _ = best_beginning(problem, mode, alone, [], self.gate_reference, self._collect)
+        start, _ = best_archived(problem, mode, alone, [], self.gate_reference, self._collect)
         self.drives, began = 0, time.perf_counter()
-        in_mode, _ = best_beginning(problem, mode, self.archived, [], self.gate_reference, self._collect)
+        in_mode, _ = best_archived(problem, mode, self.archived, [], self.gate_reference, self._collect)
         took, drives = time.perf_counter() - began, self.drives
         is_same = not in_mode.weights.refined_mode  # else both begin as the best of the same
         before = self._driven(start.weights, wish)

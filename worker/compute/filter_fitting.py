@@ -28,7 +28,7 @@ from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
-from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived, choose_archived
 from worker.ml.reinforcement.refinement import Refinement, is_promising
 from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.loading import load_reward_model
@@ -78,9 +78,18 @@ class FilterFit:
         """The person's execution mode, as far as held-out scenarios allow it; or their policy among several."""
         if isinstance(self.problem.task.modes, PolicyChoice):
             return self._choose(self.problem.task.modes)
-        surface = ResponseSurface.load(surface_file(self.task), self.problem.task.modes, self.problem.task.signals)
         reference = self._gate_reference()
-        return mode_search.find_mode(self.problem, surface, pool, reference, self.collect, self.progress)
+        return mode_search.find_mode(self.problem, self._surface(), pool, reference, self.collect, self.progress)
+
+    def choose_archived(self, pool: Pool) -> FilterDraft | None:
+        """The policy refined beforehand that is best for the person; None: the mode may be better, or there is none."""
+        if not simulation.archived_policies(self.task):
+            return None
+        problem, archived, reference = self.problem, self._archived(), self._gate_reference()
+        more_reference, known, progress = self._check_reference, pool.rollouts, self.progress
+        return choose_archived(
+            problem, self._surface(), archived, known, reference, more_reference, self.collect, progress
+        )
 
     def _choose(self, family: PolicyChoice) -> FilterDraft:
         """What every policy does in the gate's scenarios is the same for everybody, and made once per worker."""
@@ -142,19 +151,20 @@ class FilterFit:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        draft, archived = self._best_beginning(mode, known)
+        draft, archived = best_archived(self.problem, mode, self._archived(), known, reference, self.collect)
         return refining.Training(self.task, self.problem, draft, archived, known, reference, looks, config)
 
-    def _best_beginning(
-        self, draft: FilterDraft, known: Sequence[Trajectory]
-    ) -> tuple[FilterDraft, Sequence[Trajectory]]:
+    def _archived(self) -> list[ArchivedPolicy]:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
-        self.progress("comparing the mode with policies that were refined beforehand", 0.33)
+        self.progress("looking at policies that were refined beforehand", 0.05)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
             driven = self._driven(f"{self.task} refined beforehand: {name}", policy, scenarios)
             archived.append(ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name)))
-        return best_beginning(self.problem, draft, archived, known, self._gate_reference(), self.collect)
+        return archived
+
+    def _surface(self) -> ResponseSurface:
+        return ResponseSurface.load(surface_file(self.task), self.problem.task.modes, self.problem.task.signals)
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""

@@ -32,7 +32,7 @@ from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived
 from worker.ml.reinforcement.preference_rl import PolicyAct
 from worker.ml.reinforcement.refinement import Beginning, Refinement, refine
 from worker.ml.reinforcement.refinement_gate import gate_refined
@@ -206,7 +206,7 @@ class _Making:
         surface = ResponseSurface.load(simulation.surface_file(self.name), self.task.modes, self.task.signals)
         mode = find_mode(problem, surface, self.pool, gate, self._collect)
         known, policies = self.pool.rollouts, list(self.archived.values())
-        start, archived = best_beginning(problem, mode, policies, known, gate, self._collect)
+        start, archived = best_archived(problem, mode, policies, known, gate, self._collect)
         folder.mkdir(exist_ok=True)
         make_env = registry.environment_class(self.name)
         beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, archived)

@@ -22,6 +22,7 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import limits_of
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import FilterConfig
+from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.reinforcement.refinement import Refinement
 from worker.ml.rewards.reward_models import StructuredReward
@@ -148,7 +149,7 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
     Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": Refinement(steps).ahead_steps if is_ahead else 0})
     begins = FilterDraft(FilterWeights(refined=invented.small_policy(1).weights)), [AtHome.episode(7)]
     monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
-    monkeypatch.setattr(filter_fitting, "best_beginning", lambda *_: begins)
+    monkeypatch.setattr(filter_fitting, "best_archived", lambda *_: begins)
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
     fit = FilterFit("feeding", Drives(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
 
@@ -182,5 +183,5 @@ def test_what_archived_policies_do_is_driven_once_for_everybody(monkeypatch: pyt
     for wish in (1.0, -1.0):
         reward = StructuredReward(np.full((1, len(SIGNALS)), wish)).to_bytes()
         fit = FilterFit("feeding", compute, lambda: None, reward, 0, scenarios, lambda stage, share: None, references)
-        fit._best_beginning(FilterDraft(FilterWeights()), [])
+        fit.choose_archived(Pool([], []))
         assert [compute.driven[each] for each in policies.values()] == [count, count]

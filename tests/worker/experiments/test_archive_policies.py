@@ -19,7 +19,7 @@ from worker.experiments.archive_policies import ARCHETYPES, Archetype
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.reinforcement.archived_policy import best_beginning
+from worker.ml.reinforcement.archived_policy import best_archived
 from worker.ml.reinforcement.refinement import Refinement
 
 ARCHIVES = [name for name in catalogue.names() if simulation.archive_folder(name).exists()]
@@ -48,7 +48,7 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
 
     def noting(*asked: Any) -> tuple[FilterDraft, Sequence[Trajectory]]:
         began.append(len(asked[2]))
-        return best_beginning(*asked)
+        return best_archived(*asked)
 
     def passing(
         problem: FilterProblem, start: FilterDraft, driven: Any, drafts: Sequence[FilterDraft], *_: Any
@@ -56,7 +56,7 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
         """So short a training makes nothing that the gate would let through."""
         return replace(drafts[0], weights=drafts[0].weights.changed(gate=0.8 if len(began) == 3 else 1.0))
 
-    monkeypatch.setattr(archive_policies, "best_beginning", noting)
+    monkeypatch.setattr(archive_policies, "best_archived", noting)
     monkeypatch.setattr(archive_policies, "gate_refined", passing)
     make = (Archetype("even"), Archetype("level", "tilt_rad"), Archetype("wide", "lateral_offset_m", 1.0))
     record = archive_policies.archive_policies("feeding", tmp_path / "work", make, SHORT, FEW)

@@ -15,7 +15,8 @@ from app.services.answers.misfit import CHANGING, Misfit, doubt_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
-from worker.compute import filter_finishing, learning
+from worker.compute import filter_finishing, learning, simulation
+from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, refinement
 from worker.jobs.runtime import due_work, records
@@ -23,6 +24,7 @@ from worker.jobs.runtime.context import Step, WorkerContext
 from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 
 STAGES = {Method.STUDIO: ("mode", "refinement", "residual", "gate", "promise"), Method.PRINTED: ("printed",)}
 
@@ -111,12 +113,27 @@ def fit_stage(
     if stage == "refinement":
         return refinement.refine(context, run_id, job, reward, draft, shared)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
-    if stage in {"mode", "printed"}:
-        result = fit.find_mode(fits.pool_of(context, job)) if stage == "mode" else fit.fit_printed()
+    if stage == "mode":
+        result = _find_mode(context, job, fit, shared)
+    elif stage == "printed":
+        result = fit.fit_printed()
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
         result = stages[stage](fits.load_draft(context, draft))
     return context.store.put(result.to_bytes())
+
+
+def _find_mode(context: WorkerContext, job: Job, fit: FilterFit, shared: bool) -> FilterDraft:
+    """The person's mode, or the policy refined beforehand in which it is executed, if nothing is learned on from it."""
+    pool = fits.pool_of(context, job)
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+    if fits.is_refined(settings, job, shared) or not simulation.archived_policies(fit.task):
+        return fit.find_mode(pool)
+    doubt = None if shared else refinement.unlearned_doubt(context, job)
+    if doubt:
+        return refinement.unrefined(fit.find_mode(pool), doubt)
+    return fit.choose_archived(pool) or fit.find_mode(pool)
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:

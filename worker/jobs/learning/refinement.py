@@ -41,13 +41,12 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
-        newest = None if shared else records.newest_model(session, job.participant, ModelKind.REWARD)
     if not fits.is_refined(settings, job, shared):
         return draft
-    doubt = doubt_of([newest] if newest else [])
-    if doubt and not doubt.is_learned:
+    doubt = None if shared else unlearned_doubt(context, job)
+    if doubt:
         _clear_away(context, job)
-        return context.store.put(_unrefined(fits.load_draft(context, draft), doubt).to_bytes())
+        return context.store.put(unrefined(fits.load_draft(context, draft), doubt).to_bytes())
     lane = Lane.PATIENT if shared else Lane.LEARNING  # somebody waits for their last filter
     is_outdated = (lambda: False) if shared else partial(_is_outdated, context, job)
     begun = None if shared else _begun(context, run_id, job, is_outdated)
@@ -63,7 +62,15 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     return artefact
 
 
-def _unrefined(draft: FilterDraft, doubt: Misfit) -> FilterDraft:
+def unlearned_doubt(context: WorkerContext, job: Job) -> Misfit | None:
+    """About whether the reward model says all that counts for the person, where nothing richer is followed."""
+    with context.database.reading() as session:
+        newest = records.newest_model(session, job.participant, ModelKind.REWARD)
+    doubt = doubt_of([newest] if newest else [])
+    return doubt if doubt and not doubt.is_learned else None
+
+
+def unrefined(draft: FilterDraft, doubt: Misfit) -> FilterDraft:
     """The same filter; a refinement follows the reward model further than it can be trusted."""
     note = (
         f"The filter was not refined: {doubt.words} may count, which the reward model says not well enough to go far."

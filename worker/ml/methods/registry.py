@@ -50,7 +50,7 @@ from worker.ml.methods.steered_rl import Steering
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import looked_into
 from worker.ml.reinforcement import refinement
-from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_beginning
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived, choose_archived
 from worker.ml.reinforcement.guided_reward import sketchy
 from worker.ml.reinforcement.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.reinforcement.refinement import Refinement
@@ -161,6 +161,17 @@ def fit_without(setting: Setting, **changed: Any) -> tuple[Act, tuple[str, ...]]
     return fit_pbarl(replace(setting, problem=problem))
 
 
+def fit_pbarl_archived(setting: Setting) -> tuple[Act, tuple[str, ...]]:
+    """The best policy refined beforehand, in a mode of the person's own; the quick filter where none is better."""
+    problem, block = setting.problem, _gate(setting)
+    more_reference = partial(setting.reference, problem.config.check_block(problem.task))
+    surface, known, reference = setting.surface(), setting.pool.rollouts, setting.reference(block)
+    chosen = choose_archived(
+        problem, surface, setting.archived(block), known, reference, more_reference, setting.collect
+    )
+    return _shipped(setting, chosen or _fitted(setting))
+
+
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The studio's filter with its refinement, most of which is made for the first of the labels."""
     problem, reference, config = setting.problem, setting.reference(_gate(setting)), setting.config.refinement
@@ -174,11 +185,11 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
         known, collect = setting.pool.rollouts, setting.collect
-        start, driven = best_beginning(early, mode, archived, known, reference, collect)
+        start, driven = best_archived(early, mode, archived, known, reference, collect)
         refinement.refine_ahead(early, start, replace(beginning, archived=driven), config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
-            start, driven = best_beginning(problem, draft, archived, known, reference, collect)
+            start, driven = best_archived(problem, draft, archived, known, reference, collect)
             drafts: tuple[FilterDraft, ...] = ()
             if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
                 drafts = refinement.refine(problem, start, replace(beginning, archived=driven), config, checkpoint)
@@ -307,6 +318,7 @@ def fit_latent(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 METHODS: Mapping[str, FitMethod] = {
     "reference": fit_reference,
     "pbarl": fit_pbarl,
+    "pbarl_archived": fit_pbarl_archived,
     "pbarl_refined": fit_pbarl_refined,
     "pbarl_printed": partial(fit_as_printed, list_length=10),
     "pbarl_n1": partial(fit_as_printed, list_length=1),

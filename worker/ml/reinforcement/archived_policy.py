@@ -1,21 +1,24 @@
-"""Policies refined beforehand, for people who mind one signal especially: what somebody's refinement may begin as.
+"""Policies refined beforehand, for people who mind one signal especially: what somebody's filter may be, or begin as.
 
-One search finds what another misses. A refinement that begins as its person's mode stays where that leads; begun as the
-best policy that was found for anybody, by the person's own learned reward, it goes on from there (decision 192).
+One search finds what another misses, and a mode goes only where modes lead: a filter may be the best policy that was
+found for anybody, by the person's own learned reward, and a refinement goes on from there (decisions 192 and 199).
 Choosing among policies by what each has earned in the same scenarios is generalised policy improvement over whole
 policies (Barreto et al. 2017, arXiv 1606.05312). Each may be executed in a mode of the person's own, which a response
 surface around that policy foresees (decision 197).
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
-from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.gate import (
     keeps_task,
     largest_forces,
@@ -26,11 +29,11 @@ from worker.ml.filters.fitting.gate import (
     to_beat,
     trial_of,
 )
-from worker.ml.filters.fitting.mode_archive import tail_growth_n
+from worker.ml.filters.fitting.mode_archive import ModeForces, tail_growth_n
 from worker.ml.filters.fitting.mode_search import caution_of
 from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.reinforcement.refinement_gate import try_refined
+from worker.ml.reinforcement.refinement_gate import gate_refined, try_refined
 
 TRIED_IN_MODES = 5
 """each is a drive through the gate's scenarios"""
@@ -46,13 +49,14 @@ class ArchivedPolicy:
     """of modes in which it is executed, beside itself; None: they were not explored"""
 
 
-def best_beginning(
+def best_archived(
     problem: FilterProblem,
     draft: FilterDraft,
     archived: Sequence[ArchivedPolicy],
     known: Sequence[Trajectory],
     reference: Sequence[Trajectory],
     collect: Collect,
+    beaten: float | None = None,
 ) -> tuple[FilterDraft, Sequence[Trajectory]]:
     """The draft with the archived policy that the reward model likes best, or as it is where its mode is better yet.
 
@@ -60,9 +64,9 @@ def best_beginning(
     Every trial says more of the modes around its policy, where another may be sought; where anything is lost, another
     is sought more carefully, as the best of several tries is the luckiest, too. Also returns what the policy does in
     the gate's scenarios, nothing where it is the mode. ``known``: rollouts of many behaviours; ``reference``: of the
-    frozen policy in the gate's scenarios.
+    frozen policy in the gate's scenarios; ``beaten``: what modes are foreseen to gain, where none was tried.
     """
-    best, most = draft, to_beat(problem, draft, reference)
+    best, most = draft, to_beat(problem, draft, reference) if beaten is None else beaten
     driven: Sequence[Trajectory] = []
     trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
     for each, trial in zip(archived, trials, strict=True):
@@ -85,6 +89,57 @@ def best_beginning(
     return best, driven
 
 
+def choose_archived(
+    problem: FilterProblem,
+    surface: ResponseSurface,
+    archived: Sequence[ArchivedPolicy],
+    known: Sequence[Trajectory],
+    reference: Sequence[Trajectory],
+    more_reference: Callable[[], Sequence[Trajectory]],
+    collect: Collect,
+    progress: ReportProgress = lambda stage, share: None,
+) -> FilterDraft | None:
+    """The archived policy that is best for a person, in a mode of their own; None: the frozen one's may be better.
+
+    It has to gain more than ``surface`` foresees of any mode of the frozen policy, which is mostly more than that comes
+    to, and to pass what a refinement has to; see best_archived() and gate_refined().
+    """
+    if not archived:
+        return None
+    started = time.perf_counter()
+    wishes = _wishes(problem, known, reference)
+    of_frozen = replace(surface, archive=None)
+    mode = _best_mode(problem, of_frozen, of_frozen.forces, wishes)
+    beaten = float(of_frozen.predict(mode)[0] @ wishes.mean(axis=0))
+    off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
+    best, driven = best_archived(problem, FilterDraft(off), archived, known, reference, collect, beaten)
+    if not best.weights.refined:
+        return None
+    chosen = gate_refined(problem, best, driven, (), reference, more_reference, collect, progress, beaten)
+    return chosen.timed("archived", started) if chosen.weights.refined else None
+
+
+def _wishes(problem: FilterProblem, known: Sequence[Trajectory], reference: Sequence[Trajectory]) -> FloatArray:
+    """(E, S) what the reward model's members want, in the unit of a trial's preference."""
+    wanted: FloatArray = problem.reward.signal_weights(known)
+    return wanted / spread_of(problem.reward.member_returns(reference))
+
+
+def _best_mode(
+    problem: FilterProblem, surface: ResponseSurface, forces: ModeForces | None, wishes: FloatArray, lost: int = 0
+) -> FloatArray:
+    """(A,) the mode that a surface says is best; ``lost``: how many were tried that lost anything."""
+    return best_mode(
+        surface,
+        wishes,
+        problem.seed,
+        caution=caution_of(problem),
+        success_caution=problem.config.success_caution * (1 + lost),
+        forces=forces,
+        most_growth_n=problem.config.pressed_n,
+    )
+
+
 def _in_modes(
     problem: FilterProblem,
     archived: Sequence[ArchivedPolicy],
@@ -95,7 +150,7 @@ def _in_modes(
     """Those whose modes were explored."""
     if all(each.around is None for each in archived):
         return []
-    wishes = problem.reward.signal_weights(known) / spread_of(problem.reward.member_returns(reference))
+    wishes = _wishes(problem, known, reference)
     return [
         _InModes(problem, each, each.around, trial.preference, wishes)
         for each, trial in zip(archived, trials, strict=True)
@@ -129,16 +184,7 @@ class _InModes:
         self._seek()
 
     def _seek(self) -> None:
-        config = self.problem.config
-        self.mode = best_mode(
-            self.surface,
-            self.wishes,
-            self.problem.seed,
-            caution=caution_of(self.problem),
-            success_caution=config.success_caution * (1 + self.lost),
-            forces=self.forces,
-            most_growth_n=config.pressed_n,
-        )
+        self.mode = _best_mode(self.problem, self.surface, self.forces, self.wishes, self.lost)
         is_new = self.mode.any() and not any(np.array_equal(self.mode, tried) for tried in self.forces.modes)
         gained = float(self.surface.predict(self.mode)[0] @ self.wishes.mean(axis=0))
         self.foreseen = self.alone + gained if is_new else -np.inf

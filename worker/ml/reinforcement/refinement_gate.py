@@ -16,9 +16,9 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, or as what was refined beforehand for people who mind one thing, and may have gone elsewhere since."
 )
-_AS_IT_BEGAN = (
+_ARCHIVED = (
     "The filter is a policy that was refined beforehand for people who mind one thing, maybe in a way of executing it "
-    "that is this person's own: reinforcement learning on the learned preference found none better for this person."
+    "that is this person's own."
 )
 _GIVEN_UP = "The refinement had made nothing better on the way and was given up."
 _DOUBTED = "The answers do not say clearly enough that the refined policy is better, and it is off."
@@ -68,18 +68,19 @@ def gate_refined(
     more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
+    beaten: float | None = None,
 ) -> FilterDraft:
     """As much of a refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
 
-    ``start``: with the archived policy that was the best beginning, which is one of those to choose from, or with the
-    mode alone; ``archived``: what that policy does in the gate's scenarios, none of a mode; ``drafts``: of refine(),
-    none where that was given up. The whole last policy and the archived one are tried first; if the better of them will
-    not do, less of them, what had been best on the way and the archived policy in no mode are, too, and what gains most
-    comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes the gate is
-    tried in, too.
+    ``start``: with the best archived policy, which is one of those to choose from, or with the mode alone;
+    ``archived``: what that policy does in the gate's scenarios, none of a mode; ``drafts``: of refine(), none where
+    nothing was learned or that was given up. The whole last policy and the archived one are tried first; if the better
+    of them will not do, less of them, what had been best on the way and the archived policy in no mode are, too, and
+    what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes
+    the gate is tried in, too; ``beaten``: what modes are foreseen to gain, where none was tried.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
-    least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference))
+    least = max(0.0, LEAST_LIFT * (to_beat(problem, draft, reference) if beaten is None else beaten))
     tried_first = (*drafts[:1], *([start] if start.weights.refined else []))
     at_first = [(each, STRENGTHS[0]) for each in tried_first]
     in_no_mode = replace(start, weights=start.weights.changed(refined_mode={}))
@@ -118,7 +119,7 @@ def gate_refined(
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
             weights = each.draft.weights.changed(gate=each.gate)
             tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
-            note = _REFINED if any(each.draft is learned for learned in drafts) else _AS_IT_BEGAN
+            note = _REFINED if any(each.draft is learned for learned in drafts) else _ARCHIVED
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, note))
             return draft.timed("gate_refined", started)
     whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}
