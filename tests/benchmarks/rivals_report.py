@@ -26,6 +26,7 @@ TOLERANCE = 0.02
 """Largest loss of success, as a share of episodes, with which the task counts as kept."""
 CHEAP_FIRST = (
     "pbarl",
+    "pbarl_archived",
     "pbarl_refined",
     "pbarl_no_mode",
     "pbarl_no_residual",

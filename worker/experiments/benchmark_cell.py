@@ -59,7 +59,7 @@ INDIRECT_USERS: Mapping[str, Taste] = {taste.name: taste for taste in INDIRECT}
 
 def default_method(task: str) -> str:
     """The method whose filters a study of this task gets where its experimenter changes nothing."""
-    return "pbarl_refined" if usual_refinement_steps(task) else "pbarl"
+    return "pbarl_archived" if simulation.archived_policies(task) else "pbarl"
 
 
 @dataclass(frozen=True)
