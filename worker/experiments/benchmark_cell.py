@@ -18,7 +18,6 @@ import numpy.typing as npt
 import torch
 
 import worker
-from app.installed_tasks.by_name import usual_refinement_steps
 from worker.compute import learning, simulation
 from worker.compute.population import prior_of
 from worker.compute.simulation import surface_file
