@@ -61,7 +61,7 @@ def prove(fit: FilterFit, draft: FilterDraft) -> Proven:
     against = case_against(evaluation) if draft.weights.method == "studio" else ()
     if not against:
         return Proven(draft, act, evaluation, driven, {})
-    rejected = {"evaluation": evaluation, "mode": dict(draft.weights.mode), **_strengths(draft.weights)}
+    rejected = {"evaluation": evaluation, "mode": dict(draft.weights.executed_mode), **_strengths(draft.weights)}
     draft = _as_reference(draft, evaluation["preference"], against)
     act = fit.act_of(draft.weights)
     return Proven(draft, act, *_evaluate_reference(fit), rejected)
@@ -82,7 +82,7 @@ def finish(fit: FilterFit, draft: FilterDraft, provenance: Provenance, learned: 
         **_shield_activity(proven),
         "rejected": proven.rejected,
         **_strengths(draft.weights),
-        "mode": dict(draft.weights.mode),
+        "mode": dict(draft.weights.executed_mode),
         "method": draft.weights.method,
         "refined": bool(draft.weights.refined),
         "notes": [

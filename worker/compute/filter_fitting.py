@@ -47,6 +47,11 @@ TrainPatiently = Callable[[Callable[[Path], T]], T | None]
 """Calls a part of a training with the folder of its checkpoint until it is whole; None: nobody needs it any more."""
 
 
+def driven_as(task: str, archived: str) -> str:
+    """The name under which rollouts of a policy that was refined beforehand are known."""
+    return f"{task} refined beforehand: {archived}"
+
+
 @dataclass(frozen=True)
 class FilterFit:
     """One filter in the making."""
@@ -59,7 +64,7 @@ class FilterFit:
     config: FilterConfig
     progress: ReportProgress
     references: dict[tuple[str, range], list[Trajectory]]
-    """rollouts of the frozen policy that other fittings have already made"""
+    """rollouts of the frozen policy and of others, by their names, that other fittings have already made"""
     promise: Promise = field(default_factory=Promise)
     study_seed: int = 0
     version: int = 1
@@ -159,7 +164,7 @@ class FilterFit:
         self.progress("looking at policies that were refined beforehand", 0.05)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
-            driven = self._driven(f"{self.task} refined beforehand: {name}", policy, scenarios)
+            driven = self._driven(driven_as(self.task, name), policy, scenarios)
             archived.append(ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name)))
         return archived
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from worker.analysis.filters.proof import case_against
-from worker.compute import filter_finishing, learning
+from worker.compute import filter_finishing, learning, simulation
 from worker.compute.filter_finishing import Finished
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute
@@ -110,3 +110,9 @@ def test_a_sure_gain_is_published_although_it_is_quicker() -> None:
     assert finished.metrics["evaluation"]["preference"]["low"] > 0
     assert not finished.metrics["uses_reference"]
     assert finished.metrics["mode"] == {"speed_far": 0.8}
+
+
+def test_the_mode_that_is_told_of_an_archived_policy_is_the_one_it_is_executed_in() -> None:
+    policy = next(iter(simulation.archived_policies("feeding").values()))
+    in_mode = FilterWeights(refined=policy.weights, refined_mode={"speed_far": 0.3})
+    assert finish(in_mode, {"distance_m": -1.0}).metrics["mode"] == {"speed_far": 0.3}

@@ -13,7 +13,7 @@ from app.storage import ArtefactStore
 from tests.worker import invented
 from worker.analysis.filters.promise import Outcome
 from worker.compute import simulation
-from worker.compute.filter_fitting import FilterFit
+from worker.compute.filter_fitting import FilterFit, driven_as
 from worker.compute.pools import Compute
 from worker.domain.scenarios import of_promise
 from worker.jobs.learning.fits import filter_config
@@ -54,6 +54,9 @@ def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -
     cast("Compute", context.compute).close()  # whatever was missing now could not be made any more
     for scenarios in reference_blocks("feeding", SETTINGS):
         assert [each.scenario for each in fitting(context).reference(scenarios)] == list(scenarios)
+    gate, *_ = reference_blocks("feeding", SETTINGS)
+    for archived in fitting(context)._archived():
+        assert [each.scenario for each in archived.driven] == list(gate)
     drawn = promise_block(SETTINGS, 5)
     assert fitting(context)._reference_outcomes(drawn) == context.outcomes["feeding", drawn.start]
     for ahead, mine in zip(fitting(context).reference(evaluation), own, strict=True):
@@ -65,6 +68,9 @@ def test_what_is_there_is_not_made_again(context: WorkerContext, monkeypatch: py
     monkeypatch.setattr(simulation, "reference_policy", lambda _: invented.small_policy())  # others trace its filters
     for scenarios in reference_blocks("feeding", SETTINGS):
         context.references["feeding", scenarios] = []
+    gate, *_ = reference_blocks("feeding", SETTINGS)
+    for name in simulation.archived_policies("feeding"):
+        context.references[driven_as("feeding", name), gate] = []
     met = [Outcome(0.0, 0.0, True)] * len(promise_block(SETTINGS, 5))
     context.outcomes["feeding", of_promise(5).start] = met
     cast("Compute", context.compute).close()

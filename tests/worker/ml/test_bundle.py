@@ -183,6 +183,20 @@ def test_the_card_says_in_words_what_was_learned_from_the_labels(kind: str, unzi
     assert re.search(r"Reward model: (linear|an ensemble) ", card)
 
 
+@pytest.mark.parametrize("in_mode", [{}, {"speed_far": -0.41}])
+def test_the_card_of_a_refined_filter_tells_the_mode_it_is_executed_in_and_no_other(
+    unzipped: Path, in_mode: dict[str, float]
+) -> None:
+    manifest = json.loads((unzipped / "manifest.json").read_text())
+    assert manifest["mode"], "the one that was searched first"
+    card = model_card(manifest | {"refined": True, "refined_mode": in_mode})
+    _, _, way = card.partition("## This person's way")
+    assert "residual action encoder" not in card
+    assert ("| speed_far | -0.41 |" in way) == bool(in_mode)
+    assert ("| axis |" in way.partition("\n## ")[0]) == bool(in_mode)
+    assert "a refined policy" in way
+
+
 def test_the_card_of_a_laboratorys_filter_says_nothing_of_our_robot_and_person(unzipped: Path) -> None:
     manifest = json.loads((unzipped / "manifest.json").read_text())
     ours = model_card(manifest)

@@ -1,14 +1,15 @@
-"""What the first filter would wait for, made beforehand: the reference policy's rollouts, and the graphs of exports."""
+"""Made before the first filter waits for it: rollouts that are the same for everybody, and the graphs of exports."""
 
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
-from worker.compute.filter_fitting import CHUNK
+from worker.compute.filter_fitting import CHUNK, driven_as
 from worker.compute.pools import Computing, Lane
 from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import EVALUATION, first_of, of_promise
 from worker.domain.trajectory import Trajectory
+from worker.domain.type_aliases import Act
 from worker.jobs.learning.fits import filter_config, promise_of
 from worker.ml.filters.exported import filter_act
 from worker.tasks import registry
@@ -30,9 +31,9 @@ def make_ready(
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
         filter_act.trace(registry.task(task).modes, policy)
-    act = policy.mean
-    for scenarios in reference_blocks(task, settings):
-        key, made = (task, scenarios), list[Trajectory]()
+    blocks = [(task, policy.mean, each) for each in reference_blocks(task, settings)]
+    for name, act, scenarios in [*blocks, *_of_archived(task, settings)]:
+        key, made = (name, scenarios), list[Trajectory]()
         while key not in references and len(made) < len(scenarios):
             some = scenarios[len(made) : len(made) + CHUNK]
             made += compute.run(Lane.PATIENT, _no_beat, learning.run_scenarios, task, act, some, 0.0, 0)
@@ -41,7 +42,7 @@ def make_ready(
     place, met = (task, of_promise(study_seed).start), list[Outcome]()
     while len(outcomes.get(place, ())) < len(for_promise) and len(met) < len(for_promise):
         some = for_promise[len(met) : len(met) + CHUNK]
-        met += compute.run(Lane.PATIENT, _no_beat, learning.outcomes, task, act, some)
+        met += compute.run(Lane.PATIENT, _no_beat, learning.outcomes, task, policy.mean, some)
     if len(outcomes.get(place, ())) < len(met):
         outcomes[place] = met
 
@@ -54,7 +55,16 @@ def reference_blocks(task: str, settings: StudySettings) -> list[range]:
         return [evaluation]
     is_shielded = not isinstance(description.modes, PolicyChoice)  # whoever chooses among policies gets one as it is
     home = [config.home_block(description)] if is_shielded else []
-    return [config.gate_block(description), *home, evaluation]
+    check = [config.check_block(description)] if simulation.archived_policies(task) else []
+    return [config.gate_block(description), *check, *home, evaluation]
+
+
+def _of_archived(task: str, settings: StudySettings) -> list[tuple[str, Act, range]]:
+    """What policies that were refined beforehand have to be driven in, for whoever may get one of them."""
+    if settings.method is not Method.STUDIO:
+        return []
+    gate = filter_config(settings).gate_block(registry.task(task))
+    return [(driven_as(task, name), each.mean, gate) for name, each in simulation.archived_policies(task).items()]
 
 
 def promise_block(settings: StudySettings, study_seed: int) -> range:

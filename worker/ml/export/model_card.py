@@ -14,6 +14,8 @@ _COSTS = {
 _METHODS = {
     "studio": "the studio's: a personal execution mode with a residual action encoder around it, each kept only as far "
     "as it kept the task on held-out scenarios",
+    "refined": "the studio's: a policy refined by reinforcement learning, for this person or beforehand for people who "
+    "mind one thing, kept only as far as it kept the task on held-out scenarios",
     "printed": "PbARL as printed in the paper, with the readings stated in the project's docs/method.md; not gated",
 }
 _REWARDS = {
@@ -95,14 +97,14 @@ def _elsewhere(manifest: Mapping[str, Any]) -> str:
 
 
 def _what(manifest: Mapping[str, Any]) -> str:
-    labels = manifest["labels"]
+    labels, method = manifest["labels"], "refined" if manifest.get("refined") else manifest["method"]
     return (
         f"# Personal action filter: {manifest['participant']}, version {manifest['version']}\n\n"
         f"What runs after the frozen {manifest['task']} policy so that the robot does the task the way this person"
         f" prefers."
         f" Learned from {labels['count']} comparisons of two clips (study {manifest['study']}, seed {manifest['seed']},"
         f" labels sha256 `{labels['sha256'][:12]}`), exported {manifest['created_at']}.\n\n"
-        f"Method: {_METHODS[manifest['method']]}. Reward model: {_REWARDS[manifest['reward_kind']]}."
+        f"Method: {_METHODS[method]}. Reward model: {_REWARDS[manifest['reward_kind']]}."
         f" Control rate: {manifest['control_rate_hz']:g} Hz."
     )
 
@@ -133,12 +135,19 @@ def _way(manifest: Mapping[str, Any]) -> str:
     """The person's mode in words."""
     if manifest["method"] != "studio" or manifest.get("choice"):
         return ""
+    heading, mode = f"## This person's way\n\nGate {manifest['gate']:.0%}, ", manifest["mode"]
+    if manifest.get("refined"):
+        mode = manifest.get("refined_mode")
+        if not mode:
+            return f"{heading}a refined policy instead of a mode and a residual."
+        heading += "a refined policy, executed in this mode."
+    else:
+        heading += f"residual {manifest['residual_share']:.0%}."
     rows = [
-        f"| {axis['name']} | {manifest['mode'].get(axis['name'], 0.0):+.2f} | {axis['low']:g} to {axis['high']:g} "
+        f"| {axis['name']} | {mode.get(axis['name'], 0.0):+.2f} | {axis['low']:g} to {axis['high']:g} "
         f"| {axis['meaning']} |"
         for axis in manifest["mode_axes"]
     ]
-    heading = f"## This person's way\n\nGate {manifest['gate']:.0%}, residual {manifest['residual_share']:.0%}."
     return "\n".join([heading, "", "| axis | value | range | meaning |", "|---|---|---|---|", *rows])
 
 

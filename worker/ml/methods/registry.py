@@ -367,7 +367,7 @@ def _shipped(setting: Setting, draft: FilterDraft) -> tuple[Act, tuple[str, ...]
     problem = setting.problem
     draft = draft.shielded(problem.task.observation, _home(setting))
     weights = draft.weights
-    mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.mode.items()) or "off"
+    mode = ", ".join(f"{axis} {value:+.2f}" for axis, value in weights.executed_mode.items()) or "off"
     share = weights.residual_share if weights.encoder else 0.0
     refined = " Refined." if weights.refined else ""
     return _exported(problem, draft), (

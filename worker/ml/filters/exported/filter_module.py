@@ -49,6 +49,11 @@ class FilterWeights:
     """the mode in which the refined policy is executed; an axis that is not named is 0"""
 
     @property
+    def executed_mode(self) -> Mapping[str, float]:
+        """The mode that the person gets, or that from which their own refined policy was learned on."""
+        return self.refined_mode or self.mode
+
+    @property
     def moves_nothing(self) -> bool:
         """Whether the filter leaves the reference policy as it is."""
         without_residual = not self.encoder or self.residual_share == 0.0
