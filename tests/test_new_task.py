@@ -172,12 +172,6 @@ def test_the_web_server_reads_it_without_importing_it_or_what_it_needs(installed
             "usual_clip_steps = 160",
             "usual_clip_steps must not be more than the 100 steps of an episode",
         ),
-        (
-            "task.toml",
-            "usual_clip_steps = 60",
-            "usual_clip_steps = 60\nusual_refinement_steps = 500",
-            "usual_refinement_steps must be 0, for none, or at least 8,000",
-        ),
         ("task.toml", "environment:DabbingEnv", "environment.py", "task.toml: environment must be like module:name"),
         ("task.toml", "tool =", "tools =", "task.toml: words.tool is missing; words.tools is not known here."),
         ("task.toml", 'summary = "', "summary = ", "task.toml is not valid TOML: "),

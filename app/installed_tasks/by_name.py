@@ -1,7 +1,6 @@
 """What is usual in a task, by its name; also of one that is not installed here, as tasks of imported studies may be."""
 
 from app.installed_tasks import catalogue
-from app.installed_tasks.description import TaskDescription
 from app.installed_tasks.lab import LabDescription
 
 USUAL_CLIP_STEPS = 60
@@ -22,11 +21,10 @@ def usual_clip_steps(task: str) -> int:
     return installed.description.usual_clip_steps if installed else USUAL_CLIP_STEPS
 
 
-def usual_refinement_steps(task: str) -> int:
-    """How long the studio's last filters are refined, where that was measured to be worth it; else 0."""
+def archived_policy_count(task: str) -> int:
+    """How many policies were refined for a task beforehand, for people who mind one thing."""
     installed = catalogue.find(task)
-    described = installed.description if installed else None
-    return described.usual_refinement_steps if isinstance(described, TaskDescription) else 0
+    return len(list(installed.archive.glob("*.safetensors"))) if installed else 0
 
 
 def usual_behaviours(task: str, wanted: int) -> int:

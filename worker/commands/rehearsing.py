@@ -10,11 +10,11 @@ import numpy as np
 
 from app.commands.parsers import Commands, add_command
 from app.db import Database
-from app.domain.choices import ClipQuality, Method, Strategy
+from app.domain.choices import ClipQuality, Strategy
 from app.domain.protocol import EvaluationSettings
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import lab
-from app.installed_tasks.by_name import usual_behaviours, usual_refinement_steps
+from app.installed_tasks.by_name import usual_behaviours
 from app.services.archives import demo_archive
 from app.storage import ArtefactStore
 from worker.commands import options
@@ -30,10 +30,7 @@ OF_SETTINGS: options.Table = {
     "labels_per_participant": ("--labels", "labels per participant"),
     "retrain_every_labels": ("--retrain-every", "labels between two reward models"),
     "filter_milestones": ("--milestones", "labels after which a filter is trained early"),
-    "refinement_steps": (
-        "--refinement-steps",
-        "by which the last filter is refined; default: as usual in the task, 0: not at all",
-    ),
+    "refinement_steps": ("--refinement-steps", "by which the last filter is refined"),
     "method": ("--method", "how the filter is trained"),
     "reward_kind": ("--reward", "the model that is learned from the labels"),
     "strategy": ("--strategy", "which pairs are asked"),
@@ -172,8 +169,6 @@ def settings_of(said: argparse.Namespace) -> StudySettings:
     ways = usual_behaviours(said.task, usual.behaviours_per_scenario)
     chosen["behaviours_per_scenario"] = ways
     chosen["pool_scenarios"] = said.clip_scenarios or -(-labels // (ways * (ways - 1) // 2))
-    if not said.paper and chosen.get("method", usual.method) is Method.STUDIO:
-        chosen.setdefault("refinement_steps", usual_refinement_steps(said.task))
     if registry.lab(said.task) is not None:
         chosen["clip_steps"] = registry.installed_task(said.task).description.usual_clip_steps
     if said.paper:

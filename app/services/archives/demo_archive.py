@@ -4,7 +4,7 @@ from sqlalchemy.orm import Session
 
 from app.domain.study_settings import StudySettings
 from app.errors import AppError
-from app.installed_tasks.by_name import usual_behaviours, usual_clip_steps, usual_refinement_steps
+from app.installed_tasks.by_name import usual_behaviours, usual_clip_steps
 from app.paths import DEMO_STUDY
 from app.services import audit
 from app.services.archives import study_import
@@ -48,7 +48,6 @@ def usual_settings(task: str) -> StudySettings:
     situations = -(-usual.pool_scenarios * usual.pairs_per_scenario // (ways * (ways - 1) // 2))
     return StudySettings(
         clip_steps=usual_clip_steps(task),
-        refinement_steps=usual_refinement_steps(task),
         behaviours_per_scenario=ways,
         pool_scenarios=min(situations, 2 * usual.labels_per_participant),
     )

@@ -13,6 +13,7 @@ from app.domain.models import Model, ModelKind
 from app.domain.protocol import EvaluatedMethod, EvaluationMode, EvaluationSettings, Language
 from app.domain.studies import Participant, Study
 from app.installed_tasks import catalogue, hints
+from app.installed_tasks.by_name import archived_policy_count
 from app.installed_tasks.refinements import SHARE_AHEAD, answers_ahead
 from app.questionnaires import library
 from app.services.answers import hint_offers
@@ -175,6 +176,7 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         f"{percent(settings.harm_share)} of scenarios with {percent(settings.harm_confidence, 0)} confidence."
         if study.material is None
         else "",
+        archived_in_words(study),
         "The filter of all answers was then refined by soft actor-critic for "
         f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
@@ -185,6 +187,18 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
     )
     languages = [LANGUAGES[each] for each in settings.offered_languages]
     yield f"Pages were in {listed(languages, 'or')}{', as participants chose' if len(languages) > 1 else ''}."
+
+
+def archived_in_words(study: Study) -> str:
+    """What is chosen instead of an execution mode, where a task has policies that were refined beforehand."""
+    policies = archived_policy_count(study.task)
+    if study.material is not None or study.settings.method is not Method.STUDIO or not policies:
+        return ""
+    return (
+        f"A filter is one of {policies} policies that had been refined by soft actor-critic beforehand for people to "
+        "whom one thing matters most, in an execution mode of their own, wherever one gains more by the "
+        "learned preference than is foreseen of any execution mode of the pre-trained policy and keeps the task."
+    )
 
 
 def _starting_from(session: Session, study: Study) -> str:

@@ -17,7 +17,7 @@ from app.services.answers import hint_offers
 from app.services.evaluation import unblinding
 from app.services.exports import codebook, export_formats
 from app.services.paper import recruitment
-from app.services.paper.methods import METHODS
+from app.services.paper.methods import METHODS, archived_in_words
 from app.services.paper.people import rule_in_words, sample_size
 from app.services.paper.prose import count, day, listed, paragraph, percent, quoted
 from app.services.studies import locking, preregistration
@@ -103,6 +103,7 @@ def _design(study: Study, settings: StudySettings) -> Mapping[str, str]:
         + "\n".join(methods)
         + "\n\n"
         + paragraph(
+            archived_in_words(study),
             f"Filters of all answers are refined by soft actor-critic for {settings.refinement_steps:,} environment "
             "steps and kept so where that is better by the learned preference and no worse for the task."
             if settings.refinement_steps

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from app.installed_tasks import catalogue
-from app.installed_tasks.by_name import usual_refinement_steps
 from tests.benchmarks.archived_policies import MODE, tables
 from worker.__main__ import main
 from worker.compute import simulation
@@ -105,7 +104,7 @@ def test_an_archive_ships_with_the_policies_that_its_record_names(task: str) -> 
     assert sorted(shipped) == sorted(each["name"] for each in record["archetypes"] if each["kept"])
     made_for = {(each["signal"], each["sign"]) for each in record["archetypes"]}
     assert made_for <= {(each.signal, each.sign) for each in ARCHETYPES}
-    assert record["steps"] == Refinement().steps == usual_refinement_steps(task)
+    assert record["steps"] == Refinement().steps
     reference = simulation.reference_policy(task)
     around = [file.stem for file in simulation.surface_around_file(task, "even").parent.iterdir()]
     assert sorted(around) == sorted(shipped), "modes were explored around each, and around nothing else"

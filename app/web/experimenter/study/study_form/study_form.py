@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from fastapi import Form
 from pydantic import ConfigDict, Field, ValidationError, create_model
 
-from app.domain.choices import Method
 from app.domain.designs import Arm, Screen
 from app.domain.protocol import FormItem
 from app.domain.studies import NAME_LENGTH, SEED_LIMIT
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
 from app.installed_tasks import catalogue
-from app.installed_tasks.by_name import usual_clip_steps, usual_refinement_steps
+from app.installed_tasks.by_name import usual_clip_steps
 from app.services.studies import task_limits
 from app.web.experimenter.study.study_form import form_lines
 from app.web.experimenter.study.study_form.form_fields import BY_NAME, FIELDS, LINES, FormField, Kind
@@ -70,8 +69,6 @@ class Preset(StrEnum):
     PAPER = "paper"
 
 
-LEFT_TO_THE_TASK = ("clip_steps", "refinement_steps")
-"""Fields that are empty at first, and may stay so."""
 PRESETS: Mapping[Preset, StudySettings] = {Preset.LEARNING: StudySettings(), Preset.PAPER: PAPER_PROTOCOL}
 
 
@@ -96,9 +93,8 @@ class Typed:
 
 
 def form_with_defaults(preset: Preset = Preset.LEARNING) -> StudyForm:
-    """The form as it is first shown; what differs from task to task is left to the task. The paper refines nothing."""
-    left = [each for each in LEFT_TO_THE_TASK if preset is not Preset.PAPER or each != "refinement_steps"]
-    return form_of("", catalogue.usual(), None, PRESETS[preset]).model_copy(update=dict.fromkeys(left, ""))
+    """The form as it is first shown; the length of clips, which differs from task to task, is left to the task."""
+    return form_of("", catalogue.usual(), None, PRESETS[preset]).model_copy(update={"clip_steps": ""})
 
 
 def with_preset(form: StudyForm, preset: Preset) -> StudyForm:
@@ -161,7 +157,7 @@ def _as_typed(kind: Kind, value: Any) -> str | list[str]:
 
 
 def typed_study(form: StudyForm, own_task: str | None = None, *, recorded: bool = False) -> Typed:
-    """What was typed, checked; what was left empty is as usual in the task. Raises FormInvalid.
+    """What was typed, checked; clips whose length was left empty are as long as usual. Raises FormInvalid.
 
     ``own_task``: the task of a study which is changed or copied; it may stay although it is not installed here.
     ``recorded``: the study shows recordings.
@@ -169,11 +165,9 @@ def typed_study(form: StudyForm, own_task: str | None = None, *, recorded: bool 
     errors: dict[str, str] = {}
     task = own_task if recorded and own_task else _task(errors, form.task, own_task)
     values = {each.setting: _value(errors, each, form) for each in FIELDS if each.setting and each.part is None}
-    usual = _usual_in(task, values["method"], recorded)
-    for each in LEFT_TO_THE_TASK:
-        if not getattr(form, each).strip():
-            errors.pop(each, None)
-            values[each] = usual[each]
+    if not form.clip_steps.strip():
+        errors.pop("clip_steps", None)
+        values["clip_steps"] = usual_clip_steps(task)
     values["wording"] = _wording(errors, form)
     if form.evaluation == "yes":
         values["evaluation"] = {each.part: _value(errors, each, form) for each in FIELDS if each.part}
@@ -245,14 +239,6 @@ def _field(location: Sequence[int | str]) -> str:
     if location[0] == "evaluation":
         return f"evaluation_{location[1]}" if len(location) > 1 else "evaluation_methods"
     return str(location[0])
-
-
-def _usual_in(task: str, method: str, recorded: bool) -> Mapping[str, int]:
-    can_refine = method == Method.STUDIO and not recorded
-    return {
-        "clip_steps": usual_clip_steps(task),
-        "refinement_steps": usual_refinement_steps(task) if can_refine else 0,
-    }
 
 
 def _wording(errors: dict[str, str], form: StudyForm) -> dict[str, str]:
