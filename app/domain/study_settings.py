@@ -338,8 +338,8 @@ class StudySettings(BaseModel):
         Section.LEARNING,
         "Refine the last filter for",
         "By reinforcement learning, most of it while people answer; the rest takes a minute or two, in which the "
-        "participant waits. Where a task has policies that were refined beforehand, as Feeding and Drinking have, "
-        "little is gained by it (docs/results/rivals.md). 0: not at all.",
+        "participant waits. Little is gained by it where a task has policies that were refined beforehand "
+        "(docs/results/rivals.md). 0: not at all.",
         unit="steps",
         ge=0,
         le=1_000_000,
