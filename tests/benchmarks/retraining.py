@@ -4,9 +4,8 @@
 
 Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, archived
 policies, mode, residual and gates where none of these is better, promise about harm, 100 unseen scenarios, ONNX export,
-bundle. Beforehand what the worker does while
-people answer: it makes the reference policy's rollouts, in one process behind everything else. Run it alone on the
-machine: these are plain seconds.
+bundle. Beforehand what the worker does while people answer: it makes rollouts that are the same for everybody, in one
+process behind everything else. Run it alone on the machine: these are plain seconds.
 """
 
 import argparse

@@ -203,8 +203,9 @@ def test_gains_of_somebody_who_also_likes_things_are_shares_of_all_that_matters_
     assert found["cautious", "cautious"]["gain"] == pytest.approx(6.0 / (20.0 - HARDNESS.mean()))
 
 
-def test_the_refined_default_is_judged_by_everybody_where_it_stands_alone() -> None:
-    refined = [replace(each, method="pbarl_refined") if each.method == "pbarl" else each for each in RUNS]
+@pytest.mark.parametrize("default", ["pbarl_archived", "pbarl_refined"])
+def test_the_default_of_some_tasks_is_judged_by_everybody_where_it_stands_alone(default: str) -> None:
+    refined = [replace(each, method=default) if each.method == "pbarl" else each for each in RUNS]
     alone, beside = (tables(pooled(runs), [USERS], []) for runs in (refined, [*refined, *RUNS[3:6]]))
     quick = tables(pooled(RUNS), [USERS], [])
     assert alone["personalisation"] == beside["personalisation"] == quick["personalisation"] != []

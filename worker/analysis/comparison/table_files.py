@@ -23,15 +23,15 @@ from worker.analysis.comparison.comparison_rows import (
     table_rows,
 )
 
-METHOD, REFINED, BASELINES = "pbarl", "pbarl_refined", ("prefft", "prefft_anchored", "pbrl_hri")
-"""The studio's default, what it is with a refinement, and the baselines it is paired with scenario by scenario."""
+OURS, BASELINES = ("pbarl", "pbarl_archived", "pbarl_refined"), ("prefft", "prefft_anchored", "pbrl_hri")
+"""The studio's filters, the quick one first, and the baselines they are paired with scenario by scenario."""
 
 Tables = Mapping[str, Sequence[Row]]
 """By name of the file, without .csv"""
 
 DESCRIPTIONS = {
     "table1": "success, learned and true preference of every task, user and method, with changes and intervals",
-    "paired": f"`{METHOD}` minus each baseline in the same scenarios, with intervals",
+    "paired": f"`{OURS[0]}` minus each baseline in the same scenarios, with intervals",
     "personalisation": "every filter judged by every user (the matrix), and the own filter's advantage",
     "seeds": "own gain, advantage and change of success for each seed of labels, trainings and scenarios alone",
     "costs": "the six costs, summed over an episode, and their changes",
@@ -58,8 +58,8 @@ def tables(cells: Cells, groups: Sequence[Sequence[str]], users: Sequence[Row]) 
 
 
 def default_in(methods: Container[str]) -> str:
-    """The studio's default among these: refined where nothing else of it was run."""
-    return REFINED if REFINED in methods and METHOD not in methods else METHOD
+    """The first of the studio's filters among these."""
+    return next((each for each in OURS if each in methods), OURS[0])
 
 
 def to_csv(rows: Sequence[Row]) -> str:
