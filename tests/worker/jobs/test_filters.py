@@ -27,6 +27,7 @@ from worker.compute.pools import Compute
 from worker.jobs.learning import fits, refinement, reward_models
 from worker.jobs.learning.filters import (
     NothingToLearnFrom,
+    fit_stage,
     notes_on_foresight,
     notes_on_misfit,
     train_filter,
@@ -323,3 +324,43 @@ def test_the_card_of_a_filter_says_that_its_model_does_not_fit_and_what_would() 
 
 def test_a_model_that_foresees_answers_needs_no_note() -> None:
     assert notes_on_foresight(accuracy.curve([1.0] * 10)) == []
+
+
+IN_ITS_MODE = FilterDraft(FilterWeights(), notes=("mode",))
+ARCHIVED = FilterDraft(FilterWeights(), notes=("archived",))
+
+
+@pytest.mark.parametrize(
+    ("answers", "steps", "evidence", "archived", "made"),
+    [
+        (20, 0, 1.9, ARCHIVED, "archived"),
+        (20, 0, 1.9, None, "mode"),
+        (20, 0, 2.1, ARCHIVED, "not refined"),
+        (10, SHORTEST_REFINEMENT, 1.9, ARCHIVED, "archived"),
+        (20, SHORTEST_REFINEMENT, 1.9, ARCHIVED, "mode"),
+    ],
+    ids=["better", "no better", "doubted", "an earlier filter", "it is learned on from"],
+)
+def test_a_filter_is_an_archived_policy_where_that_is_better_and_the_answers_are_understood(
+    context: WorkerContext,
+    participant: Participant,
+    answered: Callable[[int], None],
+    refining: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    answers: int,
+    steps: int,
+    evidence: float,
+    archived: FilterDraft | None,
+    made: str,
+) -> None:
+    answered(answers)
+    misfit = {"misfit": {"evidence": evidence, "explanation": "arrival"}, "further": ""}
+    save_model(context, participant, ModelKind.REWARD, "all labels", misfit)
+    refining(go_on, find_mode=lambda pool: IN_ITS_MODE, choose_archived=lambda pool: archived, task="feeding")
+    with context.database.writing() as session:
+        study = session.get_one(Study, participant.study_id)
+        study.stored_settings = {**study.stored_settings, "refinement_steps": steps}
+    _, run_id = begin(context, participant, RunKind.FILTER)
+    job = filter_at(context, participant, answers)
+    draft = fit_stage(context, run_id, job, context.store.put(b"reward"), "", "mode")
+    assert made in FilterDraft.from_bytes(context.store.read(draft)).notes[-1]
