@@ -85,7 +85,7 @@ def successes_of(row: Row, whose: str = "successes") -> FloatArray:
 
 def page(rows: Sequence[Row]) -> str:
     """All below the mark."""
-    found = {name_of(row): row for row in rows}
+    found = {name_of(row): row for row in sorted(rows, key=lambda row: CHEAP_FIRST.index(row["method"]))}
     seeds = sorted({name[3] for name in found})
     defaults = ", ".join(f"`{default_method(task)}` in {task}" for task in dict.fromkeys(name[0] for name in found))
     aimed = list(product(catalogue.names(), PAPER_USERS, CHEAP_FIRST, range(GOAL_SEEDS)))

@@ -38,18 +38,18 @@ def test_a_better_rival_is_named_with_what_it_does_to_the_task() -> None:
     lossy = (np.arange(100) >= 10).astype(float)
     page = rivals_report.page(
         [
-            row("pbarl_refined", 0.10 + noise, np.ones(100)),  # the default in Feeding
+            row("pbarl_archived", 0.10 + noise, np.ones(100)),  # the default in Feeding
             row("sliders", 0.05 + noise, np.ones(100)),
             row("dsrl", 0.20 + noise, np.ones(100)),
             row("residual_rl", 0.30 + noise, lossy),
             row("prefft", 0.30 + noise, lossy, seed=1),  # the default has no such seed
         ]
     )
-    assert page.startswith("5 of 900 cells ")
+    assert page.startswith("5 of 945 cells ")
     assert "Not begun: `pbarl`, " in page
     assert "`dsrl_flow`" in page.partition("Not begun: ")[2].splitlines()[0]
     assert "`dsrl`," not in page.splitlines()[0]
-    assert "The default is `pbarl_refined` in feeding;" in page
+    assert "The default is `pbarl_archived` in feeding;" in page
     assert "Of 3 comparisons the rival is behind in 1, within the interval in 0, and ahead in 2:" in page
     assert "`dsrl` by +10.0 [+10.0, +10.0]; success +0.0 points (keeps the task)." in page
     assert "`residual_rl` by +20.0 [+20.0, +20.0]; success -10.0 points (loses the task)." in page
@@ -63,7 +63,7 @@ def test_seeds_together_judge_the_method_where_each_judges_its_training() -> Non
     rows = [
         row(method, gain + noise, ones, seed)
         for method, gains in {
-            "pbarl_refined": (0.10, 0.11, 0.12),
+            "pbarl_archived": (0.10, 0.11, 0.12),
             "dsrl": (0.13, 0.09, 0.11),
             "sliders": (0.05,) * 3,
         }.items()
@@ -77,7 +77,7 @@ def test_seeds_together_judge_the_method_where_each_judges_its_training() -> Non
     assert "`dsrl` by +0.0 [-6.6, +6.6] (within); success +0.0 points in the worst of them." in over_seeds
     assert "prefft" not in over_seeds, "two seeds say too little"
     # The three runs: standard error .58.
-    assert "| `pbarl_refined` | +11.0 [+8.5, +13.5], 3 |" in page
+    assert "| `pbarl_archived` | +11.0 [+8.5, +13.5], 3 |" in page
     assert "| `dsrl` | 2026-11-20 to 2026-11-22 |" in page
 
 
@@ -106,7 +106,7 @@ def test_the_folder_of_a_table_is_there_before_its_rows(tmp_path: Any) -> None:
 
 def test_the_picture_has_every_training_and_says_what_lies_beyond_its_edge() -> None:
     few, ones, half = np.full(100, 0.2), np.ones(100), (np.arange(100) % 2).astype(float)
-    rows = [row("pbarl_refined", few, ones, seed) for seed in range(3)]
+    rows = [row("pbarl_archived", few, ones, seed) for seed in range(3)]
     lossy = [row("dsrl", few, half), row("prefft", few - 0.6, half)]
 
     def marks(rows: list[Mapping[str, Any]]) -> int:
