@@ -151,18 +151,18 @@ def fit_reference(setting: Setting) -> tuple[Act, tuple[str, ...]]:
 
 
 def fit_pbarl(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The studio's quick filter: mode, gate, residual encoder, gate."""
+    """Mode and residual: mode, gate, residual encoder, gate."""
     return _shipped(setting, _fitted(setting))
 
 
 def fit_without(setting: Setting, **changed: Any) -> tuple[Act, tuple[str, ...]]:
-    """The quick filter without one of its parts: an ablation. ``changed``: of the FilterConfig."""
+    """Mode and residual without one of their parts: an ablation. ``changed``: of the FilterConfig."""
     problem = replace(setting.problem, config=replace(setting.problem.config, **changed))
     return fit_pbarl(replace(setting, problem=problem))
 
 
 def fit_pbarl_archived(setting: Setting) -> tuple[Act, tuple[str, ...]]:
-    """The best policy refined beforehand, in a mode of the person's own; the quick filter where none is better."""
+    """The best policy refined beforehand, in a mode of the person's own; mode and residual where none is better."""
     problem, block = setting.problem, _gate(setting)
     more_reference = partial(setting.reference, problem.config.check_block(problem.task))
     surface, known, reference = setting.surface(), setting.pool.rollouts, setting.reference(block)
