@@ -31,8 +31,8 @@ def make_ready(
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
         filter_act.trace(registry.task(task).modes, policy)
-    blocks = [(task, policy.mean, each) for each in reference_blocks(task, settings)]
-    for name, act, scenarios in [*blocks, *_of_archived(task, settings)]:
+    first, *others = [(task, policy.mean, each) for each in reference_blocks(task, settings)]
+    for name, act, scenarios in [first, *_of_archived(task, settings), *others]:
         key, made = (name, scenarios), list[Trajectory]()
         while key not in references and len(made) < len(scenarios):
             some = scenarios[len(made) : len(made) + CHUNK]
