@@ -101,8 +101,8 @@ def choose_archived(
 ) -> FilterDraft | None:
     """The archived policy that is best for a person, in a mode of their own; None: the frozen one's may be better.
 
-    It has to gain more than ``surface`` foresees of any mode of the frozen policy, which is mostly more than that comes
-    to, and to pass what a refinement has to; see best_archived() and gate_refined().
+    It has to gain more than ``surface`` foresees of any mode of the frozen policy, of which the best is most likely
+    overestimated, and to pass what a refinement has to; see best_archived() and gate_refined().
     """
     if not archived:
         return None
