@@ -11,6 +11,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from app.db import Database, now
+from app.domain.choices import Method
 from app.domain.designs import Arm, Ending
 from app.domain.models import ModelKind, Report
 from app.domain.participation import FormAnswer
@@ -291,6 +292,21 @@ def test_a_refinement_is_told_as_it_is_made(
     assert said.count("refined by soft actor-critic for 60,000 environment steps") == (steps > 0)
     if path.startswith("results"):
         assert ("steps, 90 % of them on the preference learned from the first 50 answers" in said) == (steps > 0)
+
+
+@pytest.mark.parametrize(
+    ("task", "method", "times"),
+    [("feeding", Method.STUDIO, 1), ("scratching", Method.STUDIO, 0), ("feeding", Method.PRINTED, 0)],
+)
+@pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
+def test_policies_that_were_refined_beforehand_are_told_of_where_filters_may_be_one_of_them(
+    experimenter: TestClient, database: Database, task: str, method: Method, times: int, path: str
+) -> None:
+    with database.writing() as session:
+        settings = PAPER_PROTOCOL.model_copy(update={"method": method})
+        study = studies.create_study(session, "Archived", settings, seed=1, task=task)
+    said = text_of(experimenter, study, path)
+    assert len(re.findall(r"A filter is one of \d+ policies that had been refined", said)) == times
 
 
 def test_a_preregistration_answers_every_question_of_osf(

@@ -124,7 +124,7 @@ def fit_stage(
 
 
 def _find_mode(context: WorkerContext, job: Job, fit: FilterFit, shared: bool) -> FilterDraft:
-    """The person's mode, or the policy refined beforehand in which it is executed, if nothing is learned on from it."""
+    """The best policy refined beforehand; the person's mode where none will do, or where one is learned on from."""
     pool = fits.pool_of(context, job)
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
