@@ -31,7 +31,7 @@ Tables = Mapping[str, Sequence[Row]]
 
 DESCRIPTIONS = {
     "table1": "success, learned and true preference of every task, user and method, with changes and intervals",
-    "paired": f"`{OURS[0]}` minus each baseline in the same scenarios, with intervals",
+    "paired": "the studio's filter minus each baseline in the same scenarios, with intervals",
     "personalisation": "every filter judged by every user (the matrix), and the own filter's advantage",
     "seeds": "own gain, advantage and change of success for each seed of labels, trainings and scenarios alone",
     "costs": "the six costs, summed over an episode, and their changes",
