@@ -119,7 +119,7 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "mattered": ROLLOUTS,
     "misfit": ROLLOUTS,
     "more_ways": ROLLOUTS,
-    "refined_for_others": ROLLOUTS,
+    "nonlinear_filters": ROLLOUTS,
     "comparison_report": "results/paper_form",
     "contact_sheet": "sheets feeding --films 1 --steps 5 --no-people",
     "disagreement": "feeding --file cells.csv --shares 1 --scenarios 12",

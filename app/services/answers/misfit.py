@@ -17,7 +17,7 @@ IN_WORDS: Mapping[str, str] = {
 """What explains answers, by the names of worker.ml.rewards.beyond_sums.misfit."""
 DOUBT = 2.0
 """Evidence from which on the structured model follows it (worker.ml.rewards.beyond_sums.choice), though it says
-too little for a flag. Who gives so much, and how many linear people do: docs/results/refined_for_others.md."""
+too little for a flag. Who gives so much, and how many linear people do: docs/results/nonlinear_filters.md."""
 
 
 @dataclass(frozen=True)

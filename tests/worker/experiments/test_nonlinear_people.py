@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.benchmarks.nonlinear_filters import who_serves_whom
 from tests.benchmarks.nonlinear_people import (
     ON_TIME_S,
     PEOPLE,
@@ -12,7 +13,6 @@ from tests.benchmarks.nonlinear_people import (
     on_time,
     worst_moment,
 )
-from tests.benchmarks.refined_for_others import who_serves_whom
 from tests.benchmarks.rivals_report import gains_text
 from tests.worker import invented
 from worker.domain.trajectory import SIGNALS, Trajectory

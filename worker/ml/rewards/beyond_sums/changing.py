@@ -12,7 +12,7 @@ from worker.ml.rewards.signal_scale import SignalScale
 
 LAST = 0.25
 """The share of the answers whose mean weights become the reward: those of the very last answer are known half as well,
-and who errs more and more would seem to want hardly anything in the end (docs/results/refined_for_others.md)."""
+and who errs more and more would seem to want hardly anything in the end (docs/results/nonlinear_filters.md)."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from worker.ml.rewards.signal_scale import SignalScale
 
 DOUBT = 2.0
 """Evidence against weighted sums from which on something richer is learned: less than for a flag, since terms that are
-not needed are no false word about anybody (docs/results/refined_for_others.md)."""
+not needed are no false word about anybody (docs/results/nonlinear_filters.md)."""
 
 
 def fit_by_evidence(

@@ -16,7 +16,7 @@ FAR_M = 0.30
 KNOTS = tuple(range(0, 60, 5))
 """Control steps from which on it counts that the robot has not arrived: any wish about when it arrives, early or late,
 is nearly a sum of these. Every half second: with one a second, wishes said to the tenth were learned too roughly to be
-followed (docs/results/refined_for_others.md)."""
+followed (docs/results/nonlinear_filters.md)."""
 _MOMENTS = (
     *("speed_m_s", "acceleration_squared_m2_s4", "turn_speed_squared_rad2_s2", "tilt_rad"),
     *("near_speed_squared_m2_s2", "force_at_target_n", "force_away_n"),

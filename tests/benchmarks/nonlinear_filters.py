@@ -1,12 +1,13 @@
-"""What filters give people who are not linear, how many are noticed, whose filter serves whom, and what refining gives.
+"""What filters give people who are not linear, how many are noticed, and whose filter serves whom.
 
-    python -m tests.benchmarks.refined_for_others
+    python -m tests.benchmarks.nonlinear_filters
 
 First, in minutes: in how many people of each kind something richer explains the answers so well that the reward model
 follows it, and what is foreseen of their wishes by that (tests/benchmarks/doubt.py). Then per task and person of
 tests/benchmarks/nonlinear_people.py, the paper's three types among them: 200 answers, the reward model of a study, the
-quick filter and the refined one, driven through unseen scenarios beside the reference policy and judged by what
-everybody truly wants. On one core at the lowest priority; what has a row is never run again.
+filter of mode and residual and, where policies were refined beforehand, the default's, driven through unseen scenarios
+beside the reference policy and judged by what everybody truly wants. On one core at the lowest priority; what has a row
+is never run again.
 """
 
 import argparse
@@ -45,7 +46,7 @@ from worker.ml.teachers import TASTES
 from worker.tasks import registry
 
 TITLE = "# What filters give people who are not linear"
-METHODS = QUICK, REFINED = "pbarl", "pbarl_refined"
+METHODS = SEARCHED, ARCHIVED = "pbarl", "pbarl_archived"
 Row = Mapping[str, Any]
 Name = tuple[int, str, str, str]
 """seed, task, person, method"""
@@ -58,7 +59,11 @@ def main() -> None:
     torch.set_num_threads(1)
     table = options.output.with_suffix(".csv")
     rows = _rows(table)
-    planned = product(range(options.seeds), options.tasks, options.people, options.methods)
+    planned = [
+        (seed, task, person, method)
+        for seed, task, person, method in product(range(options.seeds), options.tasks, options.people, options.methods)
+        if method == SEARCHED or simulation.archived_policies(task)
+    ]
     missing = [each for each in planned if each not in {_name_of(row) for row in rows}]
     counted = options.output.with_name(f"{options.output.name}_doubt.csv")
     for task in options.tasks:
@@ -165,17 +170,17 @@ def _report(output: Path, counted: Path) -> None:
 
 def _of_filters(rows: Mapping[Name, Row]) -> str:
     lines = [
-        "| task | person | seed | model does not fit | quick: gain, % | success, points | worst force, N"
-        " | refined: gain, % | success, points | worst force, N | of the reference | refined gains more, points |",
+        f"| task | person | seed | model does not fit | `{SEARCHED}`: gain, % | success, points | worst force, N"
+        f" | `{ARCHIVED}`: gain, % | success, points | worst force, N | of the reference | gains more, points |",
         "|---" * 12 + "|",
     ]
     for seed, task, person in dict.fromkeys(name[:3] for name in rows):
-        quick, refined = (rows.get((seed, task, person, method)) for method in METHODS)
-        some = quick or refined
-        more = "-" if quick is None or refined is None else _interval(_own(refined) - _own(quick))
+        searched, archived = (rows.get((seed, task, person, method)) for method in METHODS)
+        some = searched or archived
+        more = "-" if searched is None or archived is None else _interval(_own(archived) - _own(searched))
         lines.append(
-            f"| {task} | {person} | {seed} | {some['does_not_fit'] or '-' if some else '-'} | {_said(quick)}"
-            f" | {_said(refined)} | {some['worst_force_reference_n'] if some else '-'} | {more} |"
+            f"| {task} | {person} | {seed} | {some['does_not_fit'] or '-' if some else '-'} | {_said(searched)}"
+            f" | {_said(archived)} | {some['worst_force_reference_n'] if some else '-'} | {more} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -230,7 +235,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--linear", type=int, default=100, help="linear people whose evidence is counted")
     parser.add_argument("--work-directory", type=Path, default=Path("data/benchmark"), help="of rollouts")
     parser.add_argument(
-        "--output", type=result_tables.stem, default=Path("docs/results/refined_for_others"), help="stem of both files"
+        "--output", type=result_tables.stem, default=Path("docs/results/nonlinear_filters"), help="stem of both files"
     )
     return parser.parse_args()
 
