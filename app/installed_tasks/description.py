@@ -193,7 +193,7 @@ class InstalledTask:
 
     @property
     def archive(self) -> Path:
-        """The folder of the policies that were refined for it beforehand; most tasks have none."""
+        """The folder of the policies that were refined for it beforehand; it need not have any."""
         return self.checkpoint / "refined"
 
 

@@ -2,7 +2,9 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +22,7 @@ from app.domain.preferences import LabelEvent, Query
 from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import PAPER_PROTOCOL, StudySettings
+from app.installed_tasks import catalogue
 from app.services.answers import exclusions
 from app.services.participants import withdrawal
 from app.services.studies import locking, power, studies
@@ -27,6 +30,7 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.finished_study import make_finished_study
 from worker.analysis.study.report import make_report
+from worker.compute import simulation
 from worker.jobs.publishing import report_files
 
 Finished = Callable[..., Study]
@@ -295,18 +299,32 @@ def test_a_refinement_is_told_as_it_is_made(
 
 
 @pytest.mark.parametrize(
-    ("task", "method", "times"),
-    [("feeding", Method.STUDIO, 1), ("scratching", Method.STUDIO, 0), ("feeding", Method.PRINTED, 0)],
+    ("task", "method", "is_told"),
+    [("feeding", Method.STUDIO, True), ("scratching", Method.STUDIO, True), ("feeding", Method.PRINTED, False)],
 )
 @pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
 def test_policies_that_were_refined_beforehand_are_told_of_where_filters_may_be_one_of_them(
-    experimenter: TestClient, database: Database, task: str, method: Method, times: int, path: str
+    experimenter: TestClient, database: Database, task: str, method: Method, is_told: bool, path: str
 ) -> None:
     with database.writing() as session:
         settings = PAPER_PROTOCOL.model_copy(update={"method": method})
         study = studies.create_study(session, "Archived", settings, seed=1, task=task)
     said = text_of(experimenter, study, path)
-    assert len(re.findall(r"A filter is one of \d+ policies that had been refined", said)) == times
+    policies = [str(len(simulation.archived_policies(task)))] if is_told else []
+    assert re.findall(r"A filter is one of (\d+) policies that had been refined", said) == policies
+
+
+@pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
+def test_a_task_without_such_policies_is_not_told_of_any(
+    experimenter: TestClient, database: Database, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, path: str
+) -> None:
+    with database.writing() as session:
+        study = studies.create_study(session, "None archived", PAPER_PROTOCOL, seed=1)
+    installed = catalogue.find("feeding")
+    assert installed
+    without = replace(installed, folder=tmp_path)
+    monkeypatch.setattr(catalogue, "find", lambda _: without)
+    assert "had been refined by soft actor-critic beforehand" not in text_of(experimenter, study, path)
 
 
 def test_a_preregistration_answers_every_question_of_osf(
