@@ -20,9 +20,8 @@ import torch
 from tqdm import tqdm
 
 from app.installed_tasks import catalogue
-from worker.analysis.comparison import comparison_page
-from worker.analysis.comparison.comparison_rows import Cells, EvaluatedCell, Row, compared, pooled, table_rows
-from worker.analysis.comparison.pareto import pareto_svg
+from worker.analysis.comparison import comparison_page, pareto
+from worker.analysis.comparison.comparison_rows import Cells, EvaluatedCell, Row, pooled, table_rows
 from worker.analysis.comparison.table_files import tables, to_csv
 from worker.compute.pools import Compute, Lane
 from worker.domain.trajectory import COSTS
@@ -47,9 +46,6 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 REPORT_EVERY_S = 20.0
 SHELF_CHUNK = 10
-CLOSE_POINTS = 0.2
-"""The second picture leaves out methods that lose more success than this."""
-
 PROFILES = {
     "full": BenchmarkConfig(),
     "quick": BenchmarkConfig(
@@ -259,11 +255,8 @@ def _report(terms: BenchmarkConfig, work: Path, output: Path, command: str) -> N
     made = _made(terms, cells, command, groups, Counter(record.get("code", "not recorded") for record, _, _ in found))
     _replace(output / "made.json", json.dumps(made, indent=2) + "\n")
     _replace(output / "table1.md", comparison_page.page(output))
-    for task, all_rows in _by_task(table_rows(cells)):
-        rows = compared(all_rows)
-        _replace(output / f"pareto-{task}.svg", pareto_svg(task, rows, list(METHODS)))
-        close = [row for row in rows if row["success_delta"] >= -CLOSE_POINTS]
-        _replace(output / f"pareto-{task}-close.svg", pareto_svg(task, close, list(METHODS)))
+    for name, picture in pareto.pictures(table_rows(cells), list(METHODS)):
+        _replace(output / name, picture)
 
 
 def _finished(terms: BenchmarkConfig, work: Path) -> Iterator[tuple[dict[str, Any], dict[str, Any], Taste]]:
@@ -322,11 +315,6 @@ def _groups(users: Sequence[str]) -> list[list[str]]:
     known = [list(PAPER_USERS), list(OPPOSED_USERS), list(INDIRECT_USERS)]
     others = [user for user in users if not any(user in group for group in known)]
     return [*known, others]
-
-
-def _by_task(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
-    tasks = dict.fromkeys(row["task"] for row in rows)
-    return [(task, [row for row in rows if row["task"] == task]) for task in tasks]
 
 
 def _made(

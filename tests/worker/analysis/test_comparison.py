@@ -5,6 +5,7 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -275,6 +276,23 @@ def test_the_picture_is_valid_and_has_a_mark_per_method_and_user() -> None:
     titled = [mark[0].text or "" for mark in marks_of(rows)]
     assert sorted(titled) == sorted(row["method"] for row in rows)
     assert list(csv.reader(io.StringIO(to_csv([])))) == []
+
+
+@pytest.mark.parametrize("users", [1, 3, 24])
+def test_the_panels_of_many_users_can_be_told_apart(users: int) -> None:
+    one = [row for row in table_rows(pooled(RUNS)) if row["user"] == "neutral"]
+    rows = [{**row, "user": f"person-{number}"} for number in range(users) for row in one]
+    picture = ElementTree.fromstring(pareto_svg("feeding", rows, list(METHODS)))  # noqa: S314  (drawn by ourselves)
+    _, _, width, height = map(float, picture.attrib["viewBox"].split())
+    panels = [each for each in picture.findall("{*}rect") if each.get("fill") == "none"]
+    assert len(panels) == users
+    boxes = [[float(each.attrib[side]) for side in ("x", "y", "width", "height")] for each in panels]
+    for x, y, wide, high in boxes:
+        assert x + wide <= width
+        assert y + high <= height
+        assert wide > 0.2 * width, "on a page that is as wide as the picture"
+    for (x, y, wide, high), (other_x, other_y, _, _) in combinations(boxes, 2):
+        assert abs(x - other_x) > wide or abs(y - other_y) > high
 
 
 def test_a_method_keeps_its_colour_in_a_picture_without_the_others() -> None:

@@ -1,17 +1,21 @@
 """Success against preference as a picture: one panel per user, one mark per method, drawn as plain SVG."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
-from worker.analysis.comparison.comparison_rows import Row
+from worker.analysis.comparison.comparison_rows import Row, compared
 
 PANEL, GAP, LEFT, TOP, BOTTOM = 300.0, 46.0, 52.0, 56.0, 58.0
+SIDE_BY_SIDE = 4
+ROW = PANEL + TOP + 20.0
 LEGEND_WIDTH, LEGEND_LINE = 112.0, 18.0
 # Okabe and Ito's colours, which people with any colour vision can tell apart.
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#8a6d00", "#666666")
 TICKS = 5
+CLOSE_POINTS = 0.2
+"""The second picture leaves out methods that lose more success than this."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,15 @@ class _Look:
         )
 
 
+def pictures(rows: Sequence[Row], known: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Two for every task, by the names of their files. ``rows``: of comparison.table_rows(); ``known``: see below."""
+    for task in dict.fromkeys(row["task"] for row in rows):
+        shown = compared([row for row in rows if row["task"] == task])
+        close = [row for row in shown if row["success_delta"] >= -CLOSE_POINTS]
+        yield f"pareto-{task}.svg", pareto_svg(task, shown, known)
+        yield f"pareto-{task}-close.svg", pareto_svg(task, close, known)
+
+
 def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     """``rows``: of comparison.table_rows() for one task. Up and to the right is better; bars are 95 % intervals.
 
@@ -65,15 +78,17 @@ def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     users = list(dict.fromkeys(row["user"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     looks = {method: _Look.of(index) for index, method in enumerate(known)}
-    width = LEFT + len(users) * (PANEL + GAP)
+    width = LEFT + min(len(users), SIDE_BY_SIDE) * (PANEL + GAP)
     columns = max(1, int((width - LEFT) // LEGEND_WIDTH))
-    height = TOP + PANEL + BOTTOM + LEGEND_LINE * math.ceil(len(methods) / columns)
+    legend = TOP + (math.ceil(len(users) / SIDE_BY_SIDE) - 1) * ROW + PANEL + BOTTOM
+    height = legend + LEGEND_LINE * math.ceil(len(methods) / columns)
     body = [_text(LEFT, 22, f"{task}: success, and change of the true preference", size=14)]
     for index, user in enumerate(users):
         own = [row for row in rows if row["user"] == user]
-        body += _panel(LEFT + index * (PANEL + GAP), user, own, looks)
+        below, beside = divmod(index, SIDE_BY_SIDE)
+        body += _panel(LEFT + beside * (PANEL + GAP), TOP + below * ROW, user, own, looks)
     for index, method in enumerate(methods):
-        x, y = LEFT + index % columns * LEGEND_WIDTH, TOP + PANEL + BOTTOM + index // columns * LEGEND_LINE
+        x, y = LEFT + index % columns * LEGEND_WIDTH, legend + index // columns * LEGEND_LINE
         body.append(looks[method].drawn(x + 5, y - 4))
         body.append(_text(x + 15, y, method, size=11))
     head = (
@@ -84,18 +99,18 @@ def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
     return "\n".join([head, *body, "</svg>"]) + "\n"
 
 
-def _panel(left: float, user: str, rows: Sequence[Row], looks: dict[str, _Look]) -> list[str]:
+def _panel(left: float, top: float, user: str, rows: Sequence[Row], looks: dict[str, _Look]) -> list[str]:
     across = _axis([100 * row[f"success{end}"] for row in rows for end in ("_low", "_high")], left, left + PANEL)
-    up = _axis([row[f"true_preference_delta{end}"] for row in rows for end in ("_low", "_high")], TOP + PANEL, TOP)
-    parts = [f'<rect x="{left}" y="{TOP}" width="{PANEL}" height="{PANEL}" fill="none" stroke="#999999"/>']
-    parts.append(_text(left, TOP - 10, user, size=13))
+    up = _axis([row[f"true_preference_delta{end}"] for row in rows for end in ("_low", "_high")], top + PANEL, top)
+    parts = [f'<rect x="{left}" y="{top}" width="{PANEL}" height="{PANEL}" fill="none" stroke="#999999"/>']
+    parts.append(_text(left, top - 10, user, size=13))
     for value in across.ticks():
-        parts.append(_text(across(value), TOP + PANEL + 16, f"{value:g}", size=10, anchor="middle"))
+        parts.append(_text(across(value), top + PANEL + 16, f"{value:g}", size=10, anchor="middle"))
     for value in up.ticks():
         parts.append(_text(left - 5, up(value) + 3, f"{value:g}", size=10, anchor="end"))
     if up.low < 0 < up.high:
         parts.append(_line(left, up(0), left + PANEL, up(0), "#cccccc", "4 3"))
-    parts.append(_text(left + PANEL / 2, TOP + PANEL + 34, "success, %", size=11, anchor="middle"))
+    parts.append(_text(left + PANEL / 2, top + PANEL + 34, "success, %", size=11, anchor="middle"))
     for row in rows:
         parts += _mark(row, across, up, looks[row["method"]])
     return parts
