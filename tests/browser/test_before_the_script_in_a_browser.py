@@ -13,6 +13,7 @@ from app.domain.protocol import EvaluatedMethod, EvaluationSettings
 from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import Invited, NewPage, serious_findings, the_only, wait_ready
+from tests.waiting import until
 
 pytestmark = pytest.mark.browser
 
@@ -65,7 +66,7 @@ def test_no_pair_can_be_answered_before_the_script_is_there(invited: Invited, ne
     left = page.locator(".answer-left")
     expect(left).to_be_disabled()
     assert page.locator("video[controls]").count() == 0
-    page.wait_for_function("document.readyState != 'loading'")
+    assert until(lambda: page.evaluate("document.readyState != 'loading'"))
     left.scroll_into_view_if_needed()  # waits until the page has its style and nothing moves any more
     left.tap(force=True)
     page.keyboard.press("ArrowLeft")

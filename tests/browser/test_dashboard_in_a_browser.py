@@ -17,8 +17,11 @@ from app.storage import ArtefactStore
 from tests import factories
 from tests.browser.conftest import PATIENCE_MS, findings, overflow
 from tests.conftest import PASSWORD
+from tests.waiting import until
 
 pytestmark = pytest.mark.browser
+
+TIMES = "() => [...document.querySelectorAll('video')].map((video) => video.currentTime)"
 
 
 @pytest.fixture
@@ -208,6 +211,10 @@ def test_ticks_survive_an_update_and_new_links_ask_first(page: Page, study: Stud
     expect(page.get_by_role("heading", name="Personal links")).to_be_visible()
 
 
+def moved_alike(one: float, other: float) -> bool:
+    return one == other > 0
+
+
 def test_an_answer_is_played_on_one_clock_and_excluded(page: Page) -> None:
     page.goto("/studies/pilot/answers")
     page.get_by_role("link", name="P01, pair 3").click()
@@ -217,8 +224,7 @@ def test_an_answer_is_played_on_one_clock_and_excluded(page: Page) -> None:
     page.get_by_label("Position").focus()
     page.keyboard.press("Home")
     page.get_by_role("button", name="One frame forward").click()
-    times = "[...document.querySelectorAll('video')].map((each) => each.currentTime)"
-    page.wait_for_function(f"(() => {{ const [one, other] = {times}; return one > 0 && one === other; }})()")
+    assert until(lambda: moved_alike(*page.evaluate(TIMES)))
     page.get_by_label("Reason").fill("Was on the phone.")
     page.get_by_role("button", name="Exclude").click()
     expect(page.get_by_role("heading", name="Excluded")).to_be_visible()

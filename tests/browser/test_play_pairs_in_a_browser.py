@@ -19,6 +19,7 @@ from tests.browser.conftest import (
     the_only,
     wait_ready,
 )
+from tests.waiting import until
 
 pytestmark = pytest.mark.browser
 
@@ -27,6 +28,7 @@ TIMES = "() => [...document.querySelectorAll('video')].map((video) => video.curr
 RATES = "() => [...document.querySelectorAll('video')].map((video) => video.playbackRate)"
 AT_THE_BEGINNING = "() => [...document.querySelectorAll('video')].every((video) => video.currentTime === 0)"
 PAUSED = "() => [...document.querySelectorAll('video')].every((video) => video.paused)"
+PLAYING = "() => [...document.querySelectorAll('video')].every((video) => !video.paused)"
 SEEN_FIRST = pytest.mark.parametrize("invited", [{"answer_after_first_play": True}], indirect=True)
 
 
@@ -39,7 +41,7 @@ def events(invited: Invited, kind: str) -> list[ParticipantEvent]:
 def at_rest(page: Page) -> None:
     """Stand still, and until both have arrived there."""
     page.keyboard.press("Space")
-    page.wait_for_function(PAUSED)
+    assert until(lambda: page.evaluate(PAUSED))
 
 
 def scrub(page: Page, permille: int) -> None:
@@ -58,7 +60,7 @@ def test_space_pauses_and_plays_both(invited: Invited, new_page: NewPage) -> Non
     left, right = page.evaluate(TIMES)
     assert abs(left - right) <= 1 / factories.FPS
     page.keyboard.press("Space")
-    page.wait_for_function("() => [...document.querySelectorAll('video')].every((video) => !video.paused)")
+    assert until(lambda: page.evaluate(PLAYING))
     expect(page.get_by_role("button", name="Pause")).to_be_visible()
 
 
@@ -135,7 +137,7 @@ def test_answers_open_when_both_clips_have_been_seen_once(invited: Invited, new_
     page.keyboard.press("ArrowLeft")
     scrub(page, 990)  # the end alone is not the whole
     page.keyboard.press("Space")
-    page.wait_for_function(AT_THE_BEGINNING)  # of the next round
+    assert until(lambda: page.evaluate(AT_THE_BEGINNING)), "of the next round"
     page.keyboard.press("ArrowLeft")
     assert invited.responses() == []
     let_clips_run(page)
