@@ -62,7 +62,7 @@ class _Look:
 
 
 def pictures(rows: Sequence[Row], known: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Two for every task, by the names of their files. ``rows``: of comparison.table_rows(); ``known``: see below."""
+    """Two for every task, by the names of their files. ``rows``: of table_rows(); ``known``: see pareto_svg()."""
     for task in dict.fromkeys(row["task"] for row in rows):
         shown = compared([row for row in rows if row["task"] == task])
         close = [row for row in shown if row["success_delta"] >= -CLOSE_POINTS]
