@@ -32,11 +32,13 @@ from worker.domain.type_aliases import Act, FloatArray
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import largest_forces, signal_changes, successes
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.pool import Pool
-from worker.ml.reinforcement.archived_policy import best_archived
+from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived
+from worker.ml.reinforcement.refinement_gate import begin_as
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.tasks import registry
 
@@ -84,9 +86,9 @@ class InModes:
         problem = FilterProblem(registry.task(self.task), simulation.reference_policy(self.task), reward, 0)
         mode = find_mode(problem, self.people.surface, Pool(), self.gate_reference, self._collect)
         alone = [replace(each, around=None) for each in self.archived]
-        start, _ = best_archived(problem, mode, alone, [], self.gate_reference, self._collect)
+        start = self._begun_as(problem, mode, alone)
         self.drives, began = 0, time.perf_counter()
-        in_mode, _ = best_archived(problem, mode, self.archived, [], self.gate_reference, self._collect)
+        in_mode = self._begun_as(problem, mode, self.archived)
         took, drives = time.perf_counter() - began, self.drives
         is_same = not in_mode.weights.refined_mode  # else both begin as the best of the same
         before = self._driven(start.weights, wish)
@@ -102,6 +104,10 @@ class InModes:
             "drives": drives,
             "seconds": round(took, 1),
         }
+
+    def _begun_as(self, problem: FilterProblem, mode: FilterDraft, archived: Sequence[ArchivedPolicy]) -> FilterDraft:
+        best = best_archived(problem, mode, archived, [], self.gate_reference, self._collect)
+        return begin_as(mode, best).draft
 
     def _driven(self, weights: FilterWeights, wish: Wish) -> Row:
         act = act_of(registry.task(self.task).modes, simulation.reference_policy(self.task), weights)

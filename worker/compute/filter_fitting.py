@@ -135,13 +135,14 @@ class FilterFit:
             drafts = train(partial(refining.train, training, begun)) or ()
             if not drafts:
                 return None
-        start, archived, reference = training.draft, training.archived, training.reference
-        more_reference, progress = self._check_reference, self.progress
-        return gate_refined(self.problem, start, archived, drafts, reference, more_reference, self.collect, progress)
+        archived, reference, more_reference = training.archived, training.reference, self._check_reference
+        return gate_refined(
+            self.problem, draft, archived, drafts, reference, more_reference, self.collect, self.progress
+        )
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
         self.progress("checking what the refinement has come to", 0.34)
-        draft, reference, checkpoint = training.draft, training.reference, Checkpoint(begun)
+        draft, reference, checkpoint = training.start.draft, training.reference, Checkpoint(begun)
         return is_promising(self.problem, draft, reference, training.config, checkpoint, self.collect)
 
     def refine_ahead(self, pool: Pool, steps: int, train: TrainPatiently[bool]) -> None:
@@ -156,8 +157,8 @@ class FilterFit:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        draft, archived = best_archived(self.problem, mode, self._archived(), known, reference, self.collect)
-        return refining.Training(self.task, self.problem, draft, archived, known, reference, looks, config)
+        archived = best_archived(self.problem, mode, self._archived(), known, reference, self.collect)
+        return refining.Training(self.task, self.problem, mode, archived, known, reference, looks, config)
 
     def _archived(self) -> list[ArchivedPolicy]:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""

@@ -13,6 +13,7 @@ from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterProblem
 from worker.ml.policies.checkpoint import Checkpoint, Paused, begin_again, go_on_from
 from worker.ml.reinforcement.refinement import Beginning, Refinement, refine, refine_ahead
+from worker.ml.reinforcement.refinement_gate import ArchivedDraft, begin_as
 from worker.tasks import registry
 
 
@@ -22,12 +23,17 @@ class Training:
 
     task: str
     problem: FilterProblem
-    draft: FilterDraft
-    archived: Sequence[Trajectory]
+    mode: FilterDraft
+    archived: Sequence[ArchivedDraft]
     known: Sequence[Trajectory]
     reference: Sequence[Trajectory]
     watched: Sequence[Trajectory]
     config: Refinement
+
+    @property
+    def start(self) -> ArchivedDraft:
+        """What it begins as."""
+        return begin_as(self.mode, self.archived)
 
 
 def train(training: Training, begun: Path | None, folder: Path) -> tuple[FilterDraft, ...]:
@@ -40,7 +46,7 @@ def train(training: Training, begun: Path | None, folder: Path) -> tuple[FilterD
     if begun and is_ahead(begun, training.config):
         go_on_from(begun, folder)
     try:
-        return refine(training.problem, training.draft, _beginning(training), training.config, Checkpoint(folder))
+        return refine(training.problem, training.start.draft, _beginning(training), training.config, Checkpoint(folder))
     except Paused:
         return ()
 
@@ -52,7 +58,7 @@ def train_ahead(training: Training, folder: Path) -> bool:
     if is_ahead(folder, training.config):
         return True
     try:
-        refine_ahead(training.problem, training.draft, _beginning(training), training.config, Checkpoint(folder))
+        refine_ahead(training.problem, training.start.draft, _beginning(training), training.config, Checkpoint(folder))
     except Paused:
         return False
     return True
@@ -67,4 +73,4 @@ def is_ahead(folder: Path, config: Refinement) -> bool:
 def _beginning(training: Training) -> Beginning:
     collect = partial(run_scenarios, training.task)
     make_env = registry.environment_class(training.task)
-    return Beginning(make_env, training.known, training.reference, training.watched, collect, training.archived)
+    return Beginning(make_env, training.known, training.reference, training.watched, collect, training.start.driven)

@@ -35,7 +35,7 @@ from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived
 from worker.ml.reinforcement.preference_rl import PolicyAct
 from worker.ml.reinforcement.refinement import Beginning, Refinement, refine
-from worker.ml.reinforcement.refinement_gate import gate_refined
+from worker.ml.reinforcement.refinement_gate import begin_as, gate_refined
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.reward_models import RewardModel
 from worker.ml.rewards.segments import SegmentPairs
@@ -206,16 +206,17 @@ class _Making:
         surface = ResponseSurface.load(simulation.surface_file(self.name), self.task.modes, self.task.signals)
         mode = find_mode(problem, surface, self.pool, gate, self._collect)
         known, policies = self.pool.rollouts, list(self.archived.values())
-        start, archived = best_archived(problem, mode, policies, known, gate, self._collect)
+        archived = best_archived(problem, mode, policies, known, gate, self._collect)
+        start = begin_as(mode, archived)
         folder.mkdir(exist_ok=True)
         make_env = registry.environment_class(self.name)
-        beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, archived)
-        drafts = refine(problem, start, beginning, self.config, Checkpoint(folder))
+        beginning = Beginning(make_env, self.pool.rollouts, gate, watched, self._collect, start.driven)
+        drafts = refine(problem, start.draft, beginning, self.config, Checkpoint(folder))
         check = partial(reference, config.check_block(self.task))
-        gated = gate_refined(problem, start, archived, drafts, gate, check, self._collect)
+        gated = gate_refined(problem, mode, archived, drafts, gate, check, self._collect)
         shutil.rmtree(folder)
         weights = gated.weights
-        is_new = weights.gate == 1.0 and weights.refined is not start.weights.refined
+        is_new = weights.gate == 1.0 and any(weights.refined is each.weights.refined for each in drafts)
         return weights.refined if is_new else {}, [asdict(trial) for trial in gated.trials]
 
     def _collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:

@@ -25,6 +25,7 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.reinforcement.refinement import Refinement
+from worker.ml.reinforcement.refinement_gate import ArchivedDraft
 from worker.ml.rewards.reward_models import StructuredReward
 from worker.tasks import registry
 
@@ -147,9 +148,10 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
 ) -> None:
     steps, trained = 1_000, list[Training]()
     Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": Refinement(steps).ahead_steps if is_ahead else 0})
-    begins = FilterDraft(FilterWeights(refined=invented.small_policy(1).weights)), [AtHome.episode(7)]
+    draft = FilterDraft(FilterWeights(refined=invented.small_policy(1).weights))
+    best = [ArchivedDraft(draft, [AtHome.episode(7)])]
     monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
-    monkeypatch.setattr(filter_fitting, "best_archived", lambda *_: begins)
+    monkeypatch.setattr(filter_fitting, "best_archived", lambda *_: best)
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
     fit = FilterFit("feeding", Drives(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
 
@@ -158,7 +160,7 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
         trained.append(part.args[0])
 
     fit.refine(FilterDraft(FilterWeights()), list[Trajectory](), steps, tmp_path, noted)
-    assert [(each.draft, each.archived) for each in trained] == [begins]
+    assert [each.start for each in trained] == best
 
 
 class Episodes(AtHand):

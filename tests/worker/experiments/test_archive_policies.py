@@ -12,7 +12,6 @@ from app.installed_tasks import catalogue
 from tests.benchmarks.archived_policies import MODE, tables
 from worker.__main__ import main
 from worker.compute import simulation
-from worker.domain.trajectory import Trajectory
 from worker.experiments import archive_policies, fit_response_surface
 from worker.experiments.archive_policies import ARCHETYPES, Archetype
 from worker.ml.filters.fitting.filter_draft import FilterDraft
@@ -20,6 +19,7 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.archived_policy import best_archived
 from worker.ml.reinforcement.refinement import Refinement
+from worker.ml.reinforcement.refinement_gate import ArchivedDraft
 
 ARCHIVES = [name for name in catalogue.names() if simulation.archive_folder(name).exists()]
 FEW = FilterConfig(gate_scenarios=3, check_scenarios=2, watch_scenarios=1, mode_attempts=1, success_tolerance=1.0)
@@ -45,12 +45,12 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
     monkeypatch.setattr(fit_response_surface, "MODES_PER_SCENARIO", 1)
     began = list[int]()
 
-    def noting(*asked: Any) -> tuple[FilterDraft, Sequence[Trajectory]]:
+    def noting(*asked: Any) -> list[ArchivedDraft]:
         began.append(len(asked[2]))
         return best_archived(*asked)
 
     def passing(
-        problem: FilterProblem, start: FilterDraft, driven: Any, drafts: Sequence[FilterDraft], *_: Any
+        problem: FilterProblem, mode: FilterDraft, best: Any, drafts: Sequence[FilterDraft], *_: Any
     ) -> FilterDraft:
         """So short a training makes nothing that the gate would let through."""
         return replace(drafts[0], weights=drafts[0].weights.changed(gate=0.8 if len(began) == 3 else 1.0))

@@ -19,7 +19,13 @@ from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
 from worker.ml.filters.fitting.gate import signal_changes, trial_of
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement import refinement
-from worker.ml.reinforcement.archived_policy import TRIED_IN_MODES, ArchivedPolicy, best_archived, choose_archived
+from worker.ml.reinforcement.archived_policy import (
+    NEXT_BEST,
+    TRIED_IN_MODES,
+    ArchivedPolicy,
+    best_archived,
+    choose_archived,
+)
 from worker.ml.reinforcement.refinement import Beginning, Refinement
 from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.reward_models import StructuredReward
@@ -71,11 +77,11 @@ def test_it_begins_as_what_the_person_wants_most_of_what_keeps_the_task(referenc
         moved(1.0),
     )
     others = [a_little, much, lost, archived(liked)]
-    start, driven = best_archived(DISLIKES, NO_MODE, others, [], reference, succeeding)
+    (start, driven), *_ = best_archived(DISLIKES, NO_MODE, others, [], reference, succeeding)
     assert start.weights.refined is much.policy.weights
     assert driven is much.driven
     likes = replace(DISLIKES, reward=StructuredReward(-REWARD.weights))
-    assert best_archived(likes, NO_MODE, others, [], reference, succeeding)[0].weights.refined is liked.weights
+    assert best_archived(likes, NO_MODE, others, [], reference, succeeding)[0].draft.weights.refined is liked.weights
 
 
 def explored(each: ArchivedPolicy) -> ArchivedPolicy:
@@ -94,7 +100,7 @@ def _in_mode(policy: GaussianPolicy, mode: FloatArray, scenario: int) -> Traject
 
 def test_it_begins_as_an_archived_policy_in_the_mode_that_the_person_wants_it_in(reference: list[Trajectory]) -> None:
     plain = archived(moved(-0.5))
-    start, driven = best_archived(DISLIKES, NO_MODE, [plain, explored(plain)], [], reference, succeeding)
+    (start, driven), *_ = best_archived(DISLIKES, NO_MODE, [plain, explored(plain)], [], reference, succeeding)
     assert start.weights.refined is plain.policy.weights
     assert start.weights.refined_mode
     gained, alone = (trial_of(DISLIKES, 1.0, 0.0, reference, some).preference for some in (driven, plain.driven))
@@ -105,7 +111,7 @@ def test_it_begins_as_an_archived_policy_in_the_mode_that_the_person_wants_it_in
 
 def test_in_a_mode_that_loses_the_task_an_archived_policy_is_not_begun_as(reference: list[Trajectory]) -> None:
     plain = archived(moved(-0.5))
-    start, driven = best_archived(DISLIKES, NO_MODE, [explored(plain)], [], reference, failing)
+    (start, driven), *_ = best_archived(DISLIKES, NO_MODE, [explored(plain)], [], reference, failing)
     assert start.weights.refined is plain.policy.weights
     assert not start.weights.refined_mode
     assert driven is plain.driven
@@ -120,7 +126,7 @@ def test_whose_best_mode_loses_the_task_begins_in_a_lesser_one_that_keeps_it(ref
         tried.append(float(np.mean([each.actions[:, 0].mean() for each in driven])))
         return [replace(each, success=tried[-1] > tried[0]) for each in driven]
 
-    start, driven = best_archived(DISLIKES, NO_MODE, [plain], [], reference, drive)
+    (start, driven), *_ = best_archived(DISLIKES, NO_MODE, [plain], [], reference, drive)
     assert start.weights.refined_mode
     assert all(each.success for each in driven)
     alone, gained = (trial_of(DISLIKES, 1.0, 0.0, reference, some).preference for some in (plain.driven, driven))
@@ -135,7 +141,7 @@ def test_a_mode_that_loses_anything_is_not_begun_in_however_much_of_it_is_tolera
     def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=each.scenario > 0) for each in collect(act, scenarios, noise, seed)]
 
-    start, _ = best_archived(tolerant, NO_MODE, [plain], [], reference, drive)
+    (start, _), *_ = best_archived(tolerant, NO_MODE, [plain], [], reference, drive)
     assert start.weights.refined is plain.policy.weights
     assert not start.weights.refined_mode
 
@@ -163,11 +169,11 @@ def test_a_policy_that_loses_the_task_is_not_driven_once_more_where_no_mode_is_b
     def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         pytest.fail("It was driven again.")
 
-    assert best_archived(DISLIKES, NO_MODE, [replace(lost, around=flat)], [], reference, drive) == (NO_MODE, [])
+    assert best_archived(DISLIKES, NO_MODE, [replace(lost, around=flat)], [], reference, drive) == []
 
 
 def test_what_was_learned_from_an_archived_policy_in_a_mode_is_executed_in_none(reference: list[Trajectory]) -> None:
-    start, driven = best_archived(DISLIKES, NO_MODE, [explored(archived(moved(-0.5)))], [], reference, succeeding)
+    (start, driven), *_ = best_archived(DISLIKES, NO_MODE, [explored(archived(moved(-0.5)))], [], reference, succeeding)
     begun, *_ = refinement.refine(DISLIKES, start, Beginning(World, [], reference, reference, collect), ONLY_IMITATED)
     assert not begun.weights.refined_mode
     learned = collect(act_of(invented.TASK.modes, POLICY, begun.weights), SCENARIOS, 0.0, 0)
@@ -178,15 +184,15 @@ def test_what_was_learned_from_an_archived_policy_in_a_mode_is_executed_in_none(
 def test_whose_own_mode_is_better_than_all_of_them_begins_as_that(reference: list[Trajectory]) -> None:
     trial = GateTrial(1.0, 0.0, 99.0, 0.0, 0.0)
     with_mode = FilterDraft(FilterWeights(mode={"speed_near": -0.3}), trials=(trial,))
-    assert best_archived(DISLIKES, with_mode, [archived(moved(-1.0))], [], reference, succeeding) == (with_mode, [])
-    assert best_archived(DISLIKES, NO_MODE, [], [], reference, succeeding) == (NO_MODE, [])
-    assert best_archived(DISLIKES, NO_MODE, [archived(moved(1.0))], [], reference, succeeding) == (NO_MODE, [])
+    assert best_archived(DISLIKES, with_mode, [archived(moved(-1.0))], [], reference, succeeding) == []
+    assert best_archived(DISLIKES, NO_MODE, [], [], reference, succeeding) == []
+    assert best_archived(DISLIKES, NO_MODE, [archived(moved(1.0))], [], reference, succeeding) == []
 
 
 @pytest.mark.parametrize("mode", [NO_MODE, WEAK_MODE])
 def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajectory], mode: FilterDraft) -> None:
     policy = moved(-1.0)
-    start, _ = best_archived(DISLIKES, mode, [archived(policy)], [], reference, succeeding)
+    (start, _), *_ = best_archived(DISLIKES, mode, [archived(policy)], [], reference, succeeding)
     beginning = Beginning(World, [], reference, reference, collect)
     begun, *_ = refinement.refine(DISLIKES, start, beginning, ONLY_IMITATED)
     seen = invented.observations(300, np.random.default_rng(9))
@@ -199,18 +205,18 @@ def test_a_refinement_begins_as_the_whole_archived_policy(reference: list[Trajec
 def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_better(
     reference: list[Trajectory], learned: float, is_own: bool
 ) -> None:
-    start, driven = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    best = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
-    gated = gate_refined(DISLIKES, start, driven, [own], reference, lambda: reference, succeeding)
-    assert gated.weights.refined is (own if is_own else start).weights.refined
+    gated = gate_refined(DISLIKES, NO_MODE, best, [own], reference, lambda: reference, succeeding)
+    assert gated.weights.refined is (own if is_own else best[0].draft).weights.refined
     assert ("in a way of executing it" in gated.notes[-1]) != is_own
     assert gated.tested
 
 
 def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: list[Trajectory]) -> None:
-    start, driven = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
-    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: reference, succeeding)
-    assert gated.weights.refined is start.weights.refined
+    best = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    gated = gate_refined(DISLIKES, NO_MODE, best, [], reference, lambda: reference, succeeding)
+    assert gated.weights.refined is best[0].draft.weights.refined
     none = gate_refined(DISLIKES, NO_MODE, [], [], reference, lambda: reference, succeeding)
     assert not none.weights.refined
     assert "given up" in none.notes[-1]
@@ -219,14 +225,14 @@ def test_where_a_refinement_was_given_up_the_archived_policy_is_left(reference: 
 def test_nobody_waits_for_what_the_archived_policy_does_in_scenarios_that_it_was_tried_in(
     reference: list[Trajectory],
 ) -> None:
-    start, driven = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    best = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     more, asked = [replace(each, scenario=each.scenario + 100) for each in reference], list[int]()
 
     def noting(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         asked.extend(scenarios)
         return succeeding(act, scenarios, noise, seed)
 
-    gate_refined(DISLIKES, start, driven, [], reference, lambda: more, noting)
+    gate_refined(DISLIKES, NO_MODE, best, [], reference, lambda: more, noting)
     assert asked == [each.scenario for each in more]
 
 
@@ -272,20 +278,20 @@ def test_whoever_is_left_without_archived_policies_by_the_check_has_their_mode_s
 def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(
     reference: list[Trajectory],
 ) -> None:
-    start, driven = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
+    best = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.0))], [], reference, succeeding)
     more = [replace(each, success=True) for each in collect(POLICY.mean, range(100, 110), 0.0, 0)]
 
     def failing_there(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=each.scenario < 100) for each in succeeding(act, scenarios, noise, seed)]
 
-    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: more, failing_there)
+    gated = gate_refined(DISLIKES, NO_MODE, best, [], reference, lambda: more, failing_there)
     assert gated.weights == NO_MODE.weights
 
 
 def test_an_archived_policy_that_loses_the_task_in_its_mode_is_the_filter_in_none(reference: list[Trajectory]) -> None:
     plain = explored(archived(moved(-0.5)))
-    start, driven = best_archived(DISLIKES, NO_MODE, [plain], [], reference, succeeding)
-    assert start.weights.refined_mode
+    best = best_archived(DISLIKES, NO_MODE, [plain], [], reference, succeeding)
+    assert best[0].draft.weights.refined_mode
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
     far = 0.002 - np.mean([each.actions[:, 0].mean() for each in collect(plain.policy.mean, CHECKED, 0.0, 0)])
 
@@ -295,11 +301,46 @@ def test_an_archived_policy_that_loses_the_task_in_its_mode_is_the_filter_in_non
         is_kept = scenarios[0] not in CHECKED or np.mean([each.actions[:, 0].mean() for each in driven]) >= -far
         return [replace(each, success=bool(is_kept)) for each in driven]
 
-    gated = gate_refined(DISLIKES, start, driven, [], reference, lambda: more, drive)
+    gated = gate_refined(DISLIKES, NO_MODE, best, [], reference, lambda: more, drive)
     assert gated.weights.refined is plain.policy.weights
     assert not gated.weights.refined_mode
     assert gated.weights.gate == 1.0
     assert "refined beforehand" in gated.notes[-1]
+
+
+@pytest.mark.parametrize(("second", "is_second"), [(-1.3, True), (-0.7, False)])
+def test_where_the_best_archived_policy_loses_the_task_what_gains_most_of_the_next_best_and_less_of_it_is_the_filter(
+    reference: list[Trajectory], second: float, is_second: bool
+) -> None:
+    """80 % of a move by 2 gains more than a move by .7 and less than one by 1.3."""
+    others = [archived(moved(by)) for by in (-0.2, second, -2.0)]
+    best = best_archived(DISLIKES, NO_MODE, others, [], reference, succeeding)
+    more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
+    furthest = np.mean([each.actions[:, 0].mean() for each in collect(others[2].policy.mean, CHECKED, 0.0, 0)])
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        """Whoever goes as far as the best loses the task in more scenarios."""
+        driven = collect(act, scenarios, noise, seed)
+        is_kept = scenarios[0] not in CHECKED or np.mean([each.actions[:, 0].mean() for each in driven]) > furthest
+        return [replace(each, success=bool(is_kept)) for each in driven]
+
+    gated = gate_refined(DISLIKES, NO_MODE, best, [], reference, lambda: more, drive)
+    assert gated.weights.refined is others[1 if is_second else 2].policy.weights
+    assert gated.weights.gate == (1.0 if is_second else 0.8)
+    assert "refined beforehand" in gated.notes[-1]
+
+
+def test_each_policy_is_offered_once_in_its_best_mode_and_no_more_than_can_be_tried(
+    reference: list[Trajectory],
+) -> None:
+    plain = explored(archived(moved(-0.5)))
+    weak = [archived(moved(by)) for by in (-0.1, -0.3, -0.2, -0.4, -0.15)]
+    best = best_archived(DISLIKES, NO_MODE, [*weak, plain], [], reference, succeeding)
+    assert len(best) == 1 + NEXT_BEST
+    assert best[0].draft.weights.refined_mode
+    refined = [each.draft.weights.refined for each in best]
+    wanted = [plain, weak[3], weak[1], weak[2]]
+    assert all(found is each.policy.weights for found, each in zip(refined, wanted, strict=True))
 
 
 @pytest.mark.parametrize(("best_on_the_way", "is_own"), [(-1.4, True), (-0.8, False)])
@@ -308,8 +349,10 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
     reference: list[Trajectory], lost_where: range, best_on_the_way: float, is_own: bool
 ) -> None:
     """Wherever that shows: in the gate's scenarios or in those of the check."""
-    start, driven = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.2))], [], reference, succeeding)
-    last, best = (replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way))
+    best = best_archived(DISLIKES, NO_MODE, [archived(moved(-1.2))], [], reference, succeeding)
+    last, learned = (
+        replace(NO_MODE, weights=FilterWeights(refined=moved(by).weights)) for by in (-3.0, best_on_the_way)
+    )
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
 
     def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -318,6 +361,6 @@ def test_where_the_last_policy_loses_the_task_what_gains_most_of_all_others_is_t
         far = [each.actions[:, 0].mean() < FAR and each.scenario in lost_where for each in driven]
         return [replace(each, success=not is_far) for each, is_far in zip(driven, far, strict=True)]
 
-    gated = gate_refined(DISLIKES, start, driven, [last, best], reference, lambda: more, drive)
+    gated = gate_refined(DISLIKES, NO_MODE, best, [last, learned], reference, lambda: more, drive)
     assert gated.weights.gate == 1.0
-    assert gated.weights.refined is (best if is_own else start).weights.refined
+    assert gated.weights.refined is (learned if is_own else best[0].draft).weights.refined

@@ -54,7 +54,7 @@ from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archive
 from worker.ml.reinforcement.guided_reward import sketchy
 from worker.ml.reinforcement.preference_rl import Env, MakeEnv, PolicyAct, learned
 from worker.ml.reinforcement.refinement import Refinement
-from worker.ml.reinforcement.refinement_gate import gate_refined
+from worker.ml.reinforcement.refinement_gate import begin_as, gate_refined
 from worker.ml.rewards.reward_models import RewardModel
 
 
@@ -185,15 +185,17 @@ def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     with TemporaryDirectory() as folder:
         checkpoint = Checkpoint(Path(folder))
         known, collect = setting.pool.rollouts, setting.collect
-        start, driven = best_archived(early, mode, archived, known, reference, collect)
-        refinement.refine_ahead(early, start, replace(beginning, archived=driven), config, checkpoint)
+        start = begin_as(mode, best_archived(early, mode, archived, known, reference, collect))
+        refinement.refine_ahead(early, start.draft, replace(beginning, archived=start.driven), config, checkpoint)
 
         def refined(draft: FilterDraft) -> FilterDraft:
-            start, driven = best_archived(problem, draft, archived, known, reference, collect)
+            best = best_archived(problem, draft, archived, known, reference, collect)
             drafts: tuple[FilterDraft, ...] = ()
             if refinement.is_promising(problem, draft, reference, config, checkpoint, setting.collect):
-                drafts = refinement.refine(problem, start, replace(beginning, archived=driven), config, checkpoint)
-            return gate_refined(problem, start, driven, drafts, reference, more_reference, setting.collect)
+                start = begin_as(draft, best)
+                goes_on = replace(beginning, archived=start.driven)
+                drafts = refinement.refine(problem, start.draft, goes_on, config, checkpoint)
+            return gate_refined(problem, draft, best, drafts, reference, more_reference, setting.collect)
 
         return _shipped(setting, _fitted(setting, refined))
 

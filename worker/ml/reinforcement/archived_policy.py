@@ -33,10 +33,12 @@ from worker.ml.filters.fitting.mode_archive import ModeForces, tail_growth_n
 from worker.ml.filters.fitting.mode_search import caution_of
 from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.reinforcement.refinement_gate import gate_refined, try_refined
+from worker.ml.reinforcement.refinement_gate import ArchivedDraft, gate_refined, try_refined
 
 TRIED_IN_MODES = 5
 """each is a drive through the gate's scenarios"""
+NEXT_BEST = 3
+"""policies that are left to be tried where the best one does not pass: each is a drive through the check's scenarios"""
 
 
 @dataclass(frozen=True)
@@ -57,22 +59,23 @@ def best_archived(
     reference: Sequence[Trajectory],
     collect: Collect,
     beaten: float | None = None,
-) -> tuple[FilterDraft, Sequence[Trajectory]]:
-    """The draft with the archived policy that the reward model likes best, or as it is where its mode is better yet.
+) -> list[ArchivedDraft]:
+    """The draft with the archived policies that the reward model likes best, the best first; none: its mode is better.
 
     Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
     Every trial says more of the modes around its policy, where another may be sought; where anything is lost, another
-    is sought more carefully, as the best of several tries is the luckiest, too. Also returns what the policy does in
-    the gate's scenarios, nothing where it is the mode. ``known``: rollouts of many behaviours; ``reference``: of the
-    frozen policy in the gate's scenarios; ``beaten``: what modes are foreseen to gain, where none was tried.
+    is sought more carefully, as the best of several tries is the luckiest, too. Each policy is returned once, in its
+    best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios;
+    ``beaten``: what modes are foreseen to gain, where none was tried.
     """
-    best, most = draft, to_beat(problem, draft, reference) if beaten is None else beaten
-    driven: Sequence[Trajectory] = []
+    least = to_beat(problem, draft, reference) if beaten is None else beaten
+    found, most = list[_Found](), least
     trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
     for each, trial in zip(archived, trials, strict=True):
-        if trial.preference > most and keeps_task(problem, trial, reference):
-            best = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
-            driven, most = each.driven, trial.preference
+        if trial.preference > least and keeps_task(problem, trial, reference):
+            alone = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
+            found.append(_Found(trial.preference, each, ArchivedDraft(alone, each.driven)))
+            most = max(most, trial.preference)
     explored = _in_modes(problem, archived, trials, known, reference)
     for _ in range(TRIED_IN_MODES if explored else 0):
         some = max(explored, key=_foreseen)
@@ -83,10 +86,27 @@ def best_archived(
         candidate = replace(draft, weights=weights)
         trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
         is_kept = loses_nothing(trial) and keeps_task(problem, trial, reference)
-        if trial.preference > most and is_kept:
-            best, driven, most = candidate, tried, trial.preference
+        if trial.preference > least and is_kept:
+            found.append(_Found(trial.preference, some.archived, ArchivedDraft(candidate, tried)))
+            most = max(most, trial.preference)
         some.observe(reference, tried, is_kept=is_kept)
-    return best, driven
+    return _best_of_each(found)[: 1 + NEXT_BEST]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What is better than the mode and keeps the task."""
+
+    preference: float
+    archived: ArchivedPolicy
+    draft: ArchivedDraft
+
+
+def _best_of_each(found: Sequence[_Found]) -> list[ArchivedDraft]:
+    best = dict[int, ArchivedDraft]()
+    for each in sorted(found, key=lambda each: each.preference, reverse=True):
+        best.setdefault(id(each.archived), each.draft)
+    return list(best.values())
 
 
 def choose_archived(
@@ -112,10 +132,11 @@ def choose_archived(
     mode = _best_mode(problem, of_frozen, of_frozen.forces, wishes)
     beaten = float(of_frozen.predict(mode)[0] @ wishes.mean(axis=0))
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
-    best, driven = best_archived(problem, FilterDraft(off), archived, known, reference, collect, beaten)
-    if not best.weights.refined:
+    draft = FilterDraft(off)
+    best = best_archived(problem, draft, archived, known, reference, collect, beaten)
+    if not best:
         return None
-    chosen = gate_refined(problem, best, driven, (), reference, more_reference, collect, progress, beaten)
+    chosen = gate_refined(problem, draft, best, (), reference, more_reference, collect, progress, beaten)
     return chosen.timed("archived", started) if chosen.weights.refined else None
 
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
@@ -36,6 +37,18 @@ refinement goes far, so it must be far from where answers say little: who wanted
 had 8 in 10, who minds only what is beyond a limit gained 21 % by one that had 96 in 100 (decision 166)"""
 
 
+class ArchivedDraft(NamedTuple):
+    """A draft with a policy that was refined beforehand, and what it does in the gate's scenarios."""
+
+    draft: FilterDraft
+    driven: Sequence[Trajectory]
+
+
+def begin_as(mode: FilterDraft, archived: Sequence[ArchivedDraft]) -> ArchivedDraft:
+    """The best of those refined beforehand; where none is better, the mode, which has driven nothing."""
+    return archived[0] if archived else ArchivedDraft(mode, ())
+
+
 @dataclass(frozen=True)
 class _Passing:
     """What the gate lets through, which has to pass the check yet."""
@@ -61,8 +74,8 @@ def try_refined(
 
 def gate_refined(
     problem: FilterProblem,
-    start: FilterDraft,
-    archived: Sequence[Trajectory],
+    mode: FilterDraft,
+    archived: Sequence[ArchivedDraft],
     drafts: Sequence[FilterDraft],
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
@@ -72,19 +85,20 @@ def gate_refined(
 ) -> FilterDraft:
     """As much of a refined policy as keeps the task and is better enough than the mode, and surely so; else the mode.
 
-    ``start``: with the best archived policy, which is one of those to choose from, or with the mode alone;
-    ``archived``: what that policy does in the gate's scenarios, none of a mode; ``drafts``: of refine(), none where
-    nothing was learned or that was given up. The whole last policy and the archived one are tried first; if the better
-    of them will not do, less of them, what had been best on the way and the archived policy in no mode are, too, and
-    what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which what passes
-    the gate is tried in, too; ``beaten``: what modes are foreseen to gain, where none was tried.
+    ``archived``: of best_archived(), to choose from; ``drafts``: of refine(), none where nothing was learned or that
+    was given up. The whole last policy and the best archived one are tried first; if the better of them will not do,
+    less of them, what had been best on the way, the archived policy in no mode and the next best archived ones are,
+    too, and what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which
+    what passes the gate is tried in, too; ``beaten``: what modes are foreseen to gain, where none was tried.
     """
-    started, draft, is_doubted = time.perf_counter(), (*drafts, start)[0], False
+    started, draft, is_doubted = time.perf_counter(), (*drafts, mode)[0], False
+    driven_as, best = {id(each.draft): each.driven for each in archived}, begin_as(mode, archived).draft
     least = max(0.0, LEAST_LIFT * (to_beat(problem, draft, reference) if beaten is None else beaten))
-    tried_first = (*drafts[:1], *([start] if start.weights.refined else []))
+    tried_first = (*drafts[:1], *(each.draft for each in archived[:1]))
     at_first = [(each, STRENGTHS[0]) for each in tried_first]
-    in_no_mode = replace(start, weights=start.weights.changed(refined_mode={}))
-    later = [(in_no_mode, STRENGTHS[0])] if start.weights.refined_mode else []
+    in_no_mode = replace(best, weights=best.weights.changed(refined_mode={}))
+    later = [(in_no_mode, STRENGTHS[0])] if best.weights.refined_mode else []
+    later += [(each.draft, STRENGTHS[0]) for each in archived[1:]]
     later += [(each, gate) for gate, each in product(STRENGTHS[1:], tried_first)]
     later += [(each, gate) for each, gate in product(drafts[1:], STRENGTHS)]
 
@@ -93,8 +107,9 @@ def gate_refined(
         found = []
         for candidate, gate in tries:
             progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-            if candidate is start and gate == STRENGTHS[0]:
-                trial, driven = replace(trial_of(problem, gate, 0.0, reference, archived), refined=True), archived
+            if id(candidate) in driven_as and gate == STRENGTHS[0]:
+                driven = driven_as[id(candidate)]
+                trial = replace(trial_of(problem, gate, 0.0, reference, driven), refined=True)
             else:
                 trial, driven = try_refined(problem, candidate, gate, reference, collect)
             draft = replace(draft, trials=(*draft.trials, trial))
