@@ -90,10 +90,24 @@ def test_policies_are_made_one_after_the_other_each_once_until_asked_again(
     assert all((tmp_path / "refined" / name).read_bytes() == policy for name, policy in before.items())
     assert list(simulation.archived_policies.__wrapped__("feeding")) == ["even", "level", "level_2"]
 
+    def archived() -> list[str]:
+        return sorted(file.stem for file in (tmp_path / "refined").glob("[a-z]*.safetensors"))
+
+    def archived_already(problem: FilterProblem, mode: FilterDraft, *_: Any) -> FilterDraft:
+        """Nothing was learned that is better than one of those that are there."""
+        policy = simulation.archived_policies("feeding")["even"]
+        return replace(mode, weights=mode.weights.changed(refined=policy.weights, gate=1.0))
+
+    (tmp_path / "work" / "level-done").unlink()
+    with monkeypatch.context() as patched:
+        patched.setattr(archive_policies, "gate_refined", archived_already)
+        archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
+    assert archived() == ["even", "level", "level_2"], "what was archived before is not archived again"
+
     monkeypatch.setattr(archive_policies, "LARGEST_LOSS", -2.0)
     (tmp_path / "work" / "level-done").unlink()
     archive_policies.archive_policies("feeding", tmp_path / "work", make[1:2], SHORT, FEW)
-    assert not (tmp_path / "refined" / "level_3.safetensors").exists(), "what loses the task is not archived"
+    assert archived() == ["even", "level", "level_2"], "what loses the task is not archived"
 
 
 @pytest.mark.parametrize("task", ARCHIVES)

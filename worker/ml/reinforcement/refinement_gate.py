@@ -92,7 +92,7 @@ def gate_refined(
     what passes the gate is tried in, too; ``beaten``: what modes are foreseen to gain, where none was tried.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, mode)[0], False
-    driven_as, best = {id(each.draft): each.driven for each in archived}, begin_as(mode, archived).draft
+    already_driven, best = {id(each.draft): each.driven for each in archived}, begin_as(mode, archived).draft
     least = max(0.0, LEAST_LIFT * (to_beat(problem, draft, reference) if beaten is None else beaten))
     tried_first = (*drafts[:1], *(each.draft for each in archived[:1]))
     at_first = [(each, STRENGTHS[0]) for each in tried_first]
@@ -107,8 +107,8 @@ def gate_refined(
         found = []
         for candidate, gate in tries:
             progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
-            if id(candidate) in driven_as and gate == STRENGTHS[0]:
-                driven = driven_as[id(candidate)]
+            if id(candidate) in already_driven and gate == STRENGTHS[0]:
+                driven = already_driven[id(candidate)]
                 trial = replace(trial_of(problem, gate, 0.0, reference, driven), refined=True)
             else:
                 trial, driven = try_refined(problem, candidate, gate, reference, collect)
