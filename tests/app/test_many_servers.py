@@ -59,15 +59,16 @@ def test_attempts_to_log_in_are_limited_for_all_of_them_together(database: Datab
 def test_new_links_are_shown_by_another_server_and_the_database_alone_knows_none(
     database: Database, password: str
 ) -> None:
+    left = NewLink("the-first-participant", "https://studio/p/secret")  # nothing that a cipher spells by chance
     with database.writing() as session:
         owner = session.scalars(select(Experimenter)).one()
-        key = new_links.leave(session, owner.id, [NewLink("P01", "https://studio/p/secret")])
+        key = new_links.leave(session, owner.id, [left])
     with database.reading() as session:
-        assert new_links.pick_up(session, owner.id, key) == [NewLink("P01", "https://studio/p/secret")]
+        assert new_links.pick_up(session, owner.id, key) == [left]
         assert list(new_links.pick_up(session, owner.id + 1, key)) == []
         assert list(new_links.pick_up(session, owner.id, key + "x")) == []
         row = session.scalars(select(NewLinks)).one()
-        assert not any(word in f"{row.sealed} {row.key_sha256}" for word in ("secret", "P01", key))
+        assert not any(word in f"{row.sealed} {row.key_sha256}" for word in (left.code, "secret", key))
     with database.writing() as session:
         session.scalars(select(NewLinks)).one().expires_at = now() - timedelta(seconds=1)
     with database.reading() as session:
