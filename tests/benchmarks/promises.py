@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -102,12 +102,12 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         study_seed=number,
         version=len(PAPER_PROTOCOL.milestones),
     )
-    for ahead in (fit._gate_reference, fit._check_reference, fit._home_reference, fit._archived):
+    for ahead in (fit._gate_reference, fit._check_reference, fit._home_reference, partial(fit._archived, 0.0)):
         ahead()  # as a worker does while people answer
     started = time.process_time()
     pool = bench.setting().pool
-    draft = fit.choose_archived(pool) or fit.find_mode(pool)
-    draft = fit.gate_residual(fit.train_residual(draft))
+    draft = fit.gate_residual(fit.train_residual(fit.find_mode(pool)))
+    draft = fit.choose_archived(draft, pool)
     fitted = time.process_time()
     bare = draft.weights
     draft = fit.keep_promise(draft)

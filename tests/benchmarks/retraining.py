@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.retraining --output docs/results/retraining
 
-Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, archived
-policies, mode, residual and gates where none of these is better, promise about harm, 100 unseen scenarios, ONNX export,
-bundle. Beforehand what the worker does while people answer: it makes rollouts that are the same for everybody, in one
-process behind everything else. Run it alone on the machine: these are plain seconds.
+Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, mode,
+residual, gates, archived policies, promise about harm, 100 unseen scenarios, ONNX export, bundle. Beforehand what the
+worker does while people answer: it makes rollouts that are the same for everybody, in one process behind everything
+else. Run it alone on the machine: these are plain seconds.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from worker.ml.export.bundle import Provenance
 from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
 
-STAGES = ("reward", "archived", "mode", "residual", "gates", "promise", "evaluation_and_bundle")
+STAGES = ("reward", "mode", "residual", "gates", "archived", "promise", "evaluation_and_bundle")
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
 
 
@@ -104,13 +104,13 @@ def _run(
         outcomes=outcomes,
     )
     pool = bench.setting().pool
-    draft = fitting.choose_archived(pool)
-    mark()
-    draft = draft or fitting.find_mode(pool)
+    draft = fitting.find_mode(pool)
     mark()
     draft = fitting.train_residual(draft)
     mark()
     draft = fitting.gate_residual(draft)
+    mark()
+    draft = fitting.choose_archived(draft, pool)
     mark()
     draft = fitting.keep_promise(draft)
     mark()

@@ -42,6 +42,9 @@ PRINTED_ROLLOUTS = 100
 """Episodes of the frozen policy whose transitions the printed method is trained on."""
 
 
+_BEGUN, _COMPARED = 0.05, 0.82
+"""How far a fit is when a refinement begins, and when mode and residual are compared with archived policies."""
+
 T = TypeVar("T")
 TrainPatiently = Callable[[Callable[[Path], T]], T | None]
 """Calls a part of a training with the folder of its checkpoint until it is whole; None: nobody needs it any more."""
@@ -86,15 +89,15 @@ class FilterFit:
         reference = self._gate_reference()
         return mode_search.find_mode(self.problem, self._surface(), pool, reference, self.collect, self.progress)
 
-    def choose_archived(self, pool: Pool) -> FilterDraft | None:
-        """The policy refined beforehand that is best for the person; None: the mode may be better, or there is none."""
-        if not simulation.archived_policies(self.task):
-            return None
-        problem, archived, reference = self.problem, self._archived(), self._gate_reference()
-        more_reference, known, progress = self._check_reference, pool.rollouts, self.progress
-        return choose_archived(
-            problem, self._surface(), archived, known, reference, more_reference, self.collect, progress
-        )
+    def choose_archived(self, draft: FilterDraft, pool: Pool) -> FilterDraft:
+        """The policy refined beforehand that is best for the person, if it is better than mode and residual."""
+        problem, archived, reference = self.problem, self._archived(_COMPARED), self._gate_reference()
+
+        def progress(stage: str, _: float) -> None:
+            self.progress(stage, _COMPARED)
+
+        more_reference, known = self._check_reference, pool.rollouts
+        return choose_archived(problem, draft, archived, known, reference, more_reference, self.collect, progress)
 
     def _choose(self, family: PolicyChoice) -> FilterDraft:
         """What every policy does in the gate's scenarios is the same for everybody, and made once per worker."""
@@ -157,12 +160,15 @@ class FilterFit:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        archived = best_archived(self.problem, mode, self._archived(), known, reference, self.collect)
+        archived = best_archived(self.problem, mode, self._archived(_BEGUN), known, reference, self.collect)
         return refining.Training(self.task, self.problem, mode, archived, known, reference, looks, config)
 
-    def _archived(self) -> list[ArchivedPolicy]:
-        """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
-        self.progress("looking at policies that were refined beforehand", 0.05)
+    def _archived(self, share: float) -> list[ArchivedPolicy]:
+        """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker.
+
+        ``share``: of the fit that is done.
+        """
+        self.progress("looking at policies that were refined beforehand", share)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
             driven = self._driven(driven_as(self.task, name), policy, scenarios)

@@ -26,7 +26,10 @@ from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 
-STAGES = {Method.STUDIO: ("mode", "refinement", "residual", "gate", "promise"), Method.PRINTED: ("printed",)}
+STAGES = {
+    Method.STUDIO: ("mode", "refinement", "residual", "gate", "archived", "promise"),
+    Method.PRINTED: ("printed",),
+}
 
 
 class NothingToLearnFrom(AppError):
@@ -114,26 +117,29 @@ def fit_stage(
         return refinement.refine(context, run_id, job, reward, draft, shared)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
     if stage == "mode":
-        result = _find_mode(context, job, fit, shared)
+        result = fit.find_mode(fits.pool_of(context, job))
     elif stage == "printed":
         result = fit.fit_printed()
+    elif stage == "archived":
+        result = _choose_archived(context, job, fit, fits.load_draft(context, draft), shared)
     else:
         stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
         result = stages[stage](fits.load_draft(context, draft))
     return context.store.put(result.to_bytes())
 
 
-def _find_mode(context: WorkerContext, job: Job, fit: FilterFit, shared: bool) -> FilterDraft:
-    """The best policy refined beforehand; the person's mode where none will do, or where one is learned on from."""
-    pool = fits.pool_of(context, job)
+def _choose_archived(
+    context: WorkerContext, job: Job, fit: FilterFit, draft: FilterDraft, shared: bool
+) -> FilterDraft:
+    """The best policy refined beforehand, if better; a refinement has been compared with it when it was learned."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
     if fits.is_refined(settings, job, shared) or not simulation.archived_policies(fit.task):
-        return fit.find_mode(pool)
+        return draft
     doubt = None if shared else refinement.unlearned_doubt(context, job)
     if doubt:
-        return refinement.unrefined(fit.find_mode(pool), doubt)
-    return fit.choose_archived(pool) or fit.find_mode(pool)
+        return refinement.unrefined(draft, doubt)
+    return fit.choose_archived(draft, fits.pool_of(context, job))
 
 
 def _publish(context: WorkerContext, run_id: int, job: Job, reward: str, draft: str) -> None:

@@ -163,13 +163,12 @@ def fit_without(setting: Setting, **changed: Any) -> tuple[Act, tuple[str, ...]]
 
 def fit_pbarl_archived(setting: Setting) -> tuple[Act, tuple[str, ...]]:
     """The best policy refined beforehand, in a mode of the person's own; mode and residual where none is better."""
-    problem, block = setting.problem, _gate(setting)
+    problem, block, known = setting.problem, _gate(setting), setting.pool.rollouts
+    archived, reference = setting.archived(block), setting.reference(block)
     more_reference = partial(setting.reference, problem.config.check_block(problem.task))
-    surface, known, reference = setting.surface(), setting.pool.rollouts, setting.reference(block)
-    chosen = choose_archived(
-        problem, surface, setting.archived(block), known, reference, more_reference, setting.collect
-    )
-    return _shipped(setting, chosen or _fitted(setting))
+    own = _fitted(setting)
+    better = choose_archived(problem, own, archived, known, reference, more_reference, setting.collect)
+    return _shipped(setting, better)
 
 
 def fit_pbarl_refined(setting: Setting) -> tuple[Act, tuple[str, ...]]:

@@ -20,6 +20,7 @@ from worker.ml.filters.exported.shield import untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.gate import (
+    gained,
     keeps_task,
     largest_forces,
     loses_nothing,
@@ -66,7 +67,7 @@ def best_archived(
     Every trial says more of the modes around its policy, where another may be sought; where anything is lost, another
     is sought more carefully, as the best of several tries is the luckiest, too. Each policy is returned once, in its
     best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios;
-    ``beaten``: what modes are foreseen to gain, where none was tried.
+    ``beaten``: what has to be gained; None: what the draft's mode gains.
     """
     least = to_beat(problem, draft, reference) if beaten is None else beaten
     found, most = list[_Found](), least
@@ -111,33 +112,31 @@ def _best_of_each(found: Sequence[_Found]) -> list[ArchivedDraft]:
 
 def choose_archived(
     problem: FilterProblem,
-    surface: ResponseSurface,
+    own: FilterDraft,
     archived: Sequence[ArchivedPolicy],
     known: Sequence[Trajectory],
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,
     progress: ReportProgress = lambda stage, share: None,
-) -> FilterDraft | None:
-    """The archived policy that is best for a person, in a mode of their own; None: the frozen one's may be better.
+) -> FilterDraft:
+    """The archived policy that is best for a person, in a mode of their own, if it is better than ``own``; else that.
 
-    It has to gain more than ``surface`` foresees of any mode of the frozen policy, of which the best is most likely
-    overestimated, and to pass what a refinement has to; see best_archived() and gate_refined().
+    It has to gain more than ``own``, mode and residual, has gained in the same scenarios, and to pass what a refinement
+    has to; see best_archived() and gate_refined().
     """
-    if not archived:
-        return None
-    started = time.perf_counter()
-    wishes = _wishes(problem, known, reference)
-    of_frozen = replace(surface, archive=None)
-    mode = _best_mode(problem, of_frozen, of_frozen.forces, wishes)
-    beaten = float(of_frozen.predict(mode)[0] @ wishes.mean(axis=0))
+    if not archived or own.weights.refined:
+        return own
+    started, beaten = time.perf_counter(), gained(problem, own, reference)
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     draft = FilterDraft(off)
     best = best_archived(problem, draft, archived, known, reference, collect, beaten)
     if not best:
-        return None
+        return own.timed("archived", started)
     chosen = gate_refined(problem, draft, best, (), reference, more_reference, collect, progress, beaten)
-    return chosen.timed("archived", started) if chosen.weights.refined else None
+    trials = (*own.trials, *chosen.trials)
+    better = replace(chosen, seconds={**own.seconds, **chosen.seconds}) if chosen.weights.refined else own
+    return replace(better, trials=trials).timed("archived", started)
 
 
 def _wishes(problem: FilterProblem, known: Sequence[Trajectory], reference: Sequence[Trajectory]) -> FloatArray:

@@ -89,11 +89,11 @@ def gate_refined(
     was given up. The whole last policy and the best archived one are tried first; if the better of them will not do,
     less of them, what had been best on the way, the archived policy in no mode and the next best archived ones are,
     too, and what gains most comes first. ``more_reference``: the frozen policy in the scenarios of the check, which
-    what passes the gate is tried in, too; ``beaten``: what modes are foreseen to gain, where none was tried.
+    what passes the gate is tried in, too; ``beaten``: what has to be gained; None: LEAST_LIFT times the mode's gain.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, mode)[0], False
     already_driven, best = {id(each.draft): each.driven for each in archived}, begin_as(mode, archived).draft
-    least = max(0.0, LEAST_LIFT * (to_beat(problem, draft, reference) if beaten is None else beaten))
+    least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference) if beaten is None else beaten)
     tried_first = (*drafts[:1], *(each.draft for each in archived[:1]))
     at_first = [(each, STRENGTHS[0]) for each in tried_first]
     in_no_mode = replace(best, weights=best.weights.changed(refined_mode={}))

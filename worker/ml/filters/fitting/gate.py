@@ -144,6 +144,14 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
     return trial.preference if trial and acceptable(problem, trial, reference) else 0.0
 
 
+def gained(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Trajectory]) -> float:
+    """The change of the learned return that the draft's mode and residual have made in the gate's scenarios."""
+    share = draft.weights.residual_share
+    if not share:
+        return to_beat(problem, draft, reference)
+    return next(each.preference for each in draft.trials if not each.refined and each.residual_share == share)
+
+
 def _pressed(
     problem: FilterProblem, reference: Sequence[Trajectory], filtered: Sequence[Trajectory]
 ) -> npt.NDArray[np.bool_]:
