@@ -185,5 +185,5 @@ def test_what_archived_policies_do_is_driven_once_for_everybody(monkeypatch: pyt
     for wish in (1.0, -1.0):
         reward = StructuredReward(np.full((1, len(SIGNALS)), wish)).to_bytes()
         fit = FilterFit("feeding", compute, lambda: None, reward, 0, scenarios, lambda stage, share: None, references)
-        fit.choose_archived(Pool([], []))
+        fit.choose_archived(FilterDraft(FilterWeights()), Pool([], []))
         assert [compute.driven[each] for each in policies.values()] == [count, count]

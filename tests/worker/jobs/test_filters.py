@@ -326,22 +326,21 @@ def test_a_model_that_foresees_answers_needs_no_note() -> None:
     assert notes_on_foresight(accuracy.curve([1.0] * 10)) == []
 
 
-IN_ITS_MODE = FilterDraft(FilterWeights(), notes=("mode",))
+OWN = FilterDraft(FilterWeights(), notes=("mode and residual",))
 ARCHIVED = FilterDraft(FilterWeights(), notes=("archived",))
 
 
 @pytest.mark.parametrize(
-    ("answers", "steps", "evidence", "archived", "made"),
+    ("answers", "steps", "evidence", "made"),
     [
-        (20, 0, 1.9, ARCHIVED, "archived"),
-        (20, 0, 1.9, None, "mode"),
-        (20, 0, 2.1, ARCHIVED, "not refined"),
-        (10, SHORTEST_REFINEMENT, 1.9, ARCHIVED, "archived"),
-        (20, SHORTEST_REFINEMENT, 1.9, ARCHIVED, "mode"),
+        (20, 0, 1.9, "archived"),
+        (20, 0, 2.1, "not refined"),
+        (10, SHORTEST_REFINEMENT, 1.9, "archived"),
+        (20, SHORTEST_REFINEMENT, 1.9, "mode and residual"),
     ],
-    ids=["better", "no better", "doubted", "an earlier filter", "it is learned on from"],
+    ids=["the usual", "doubted", "an earlier filter", "it was learned on from"],
 )
-def test_a_filter_is_an_archived_policy_where_that_is_better_and_the_answers_are_understood(
+def test_a_filter_is_compared_with_archived_policies_where_the_answers_are_understood_and_nothing_was_refined(
     context: WorkerContext,
     participant: Participant,
     answered: Callable[[int], None],
@@ -350,17 +349,17 @@ def test_a_filter_is_an_archived_policy_where_that_is_better_and_the_answers_are
     answers: int,
     steps: int,
     evidence: float,
-    archived: FilterDraft | None,
     made: str,
 ) -> None:
     answered(answers)
     misfit = {"misfit": {"evidence": evidence, "explanation": "arrival"}, "further": ""}
     save_model(context, participant, ModelKind.REWARD, "all labels", misfit)
-    refining(go_on, find_mode=lambda pool: IN_ITS_MODE, choose_archived=lambda pool: archived, task="feeding")
+    refining(go_on, choose_archived=lambda own, pool: ARCHIVED, task="feeding")
+    monkeypatch.setattr(fits, "load_draft", lambda *_: OWN)
     with context.database.writing() as session:
         study = session.get_one(Study, participant.study_id)
         study.stored_settings = {**study.stored_settings, "refinement_steps": steps}
     _, run_id = begin(context, participant, RunKind.FILTER)
     job = filter_at(context, participant, answers)
-    draft = fit_stage(context, run_id, job, context.store.put(b"reward"), "", "mode")
+    draft = fit_stage(context, run_id, job, context.store.put(b"reward"), "of mode and residual", "archived")
     assert made in FilterDraft.from_bytes(context.store.read(draft)).notes[-1]

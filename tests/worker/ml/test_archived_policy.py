@@ -236,43 +236,62 @@ def test_nobody_waits_for_what_the_archived_policy_does_in_scenarios_that_it_was
     assert asked == [each.scenario for each in more]
 
 
-@pytest.mark.parametrize(("times_as_much", "is_chosen"), [(0.0, True), (1.0, True), (100.0, False)])
-def test_whoever_gains_more_by_an_archived_policy_than_is_foreseen_of_modes_gets_it_without_a_search_of_modes(
+def residual(gained: float, of_mode: float = 0.1) -> FilterDraft:
+    """Mode and residual, which have gained so much in the gate's scenarios and little in others."""
+    weights = FilterWeights(mode={"speed_near": -0.3}, encoder={"weight": np.ones(1, np.float32)}, residual_share=1.5)
+    shares = [(0.0, of_mode), (1.0, 0.5 * gained), (1.5, gained), (1.5, 0.2 * gained)]
+    return FilterDraft(weights, trials=tuple(GateTrial(1.0, share, some, 0.0, 0.0) for share, some in shares))
+
+
+@pytest.mark.parametrize(("times_as_much", "is_chosen"), [(0.9, True), (1.1, False)])
+def test_whoever_gains_more_by_an_archived_policy_than_by_mode_and_residual_gets_it(
     reference: list[Trajectory], times_as_much: float, is_chosen: bool
 ) -> None:
-    policy, far = explored(archived(moved(-1.0))), explored(archived(POLICY)).around
-    assert far
-    surface = replace(far, coefficients=times_as_much * far.coefficients)
+    policy = archived(moved(-1.0))
+    own = residual(times_as_much * trial_of(DISLIKES, 1.0, 0.0, reference, policy.driven).preference)
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
-    driven = list[Act]()
-
-    def noting(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        driven.append(act)
-        return succeeding(act, scenarios, noise, seed)
-
-    chosen = choose_archived(DISLIKES, surface, [policy], [], reference, lambda: more, noting)
+    chosen = choose_archived(DISLIKES, own, [policy], [], reference, lambda: more, succeeding)
+    assert chosen.trials[: len(own.trials)] == own.trials
     if not is_chosen:
-        assert (chosen, driven) == (None, [])
+        assert chosen.weights is own.weights
         return
-    assert chosen is not None
     assert chosen.weights.refined is policy.policy.weights
     assert not chosen.weights.mode
+    assert not chosen.weights.encoder
     assert chosen.tested
+    assert chosen.trials[-1].refined
 
 
-def test_whoever_is_left_without_archived_policies_by_the_check_has_their_mode_searched(
+@pytest.mark.parametrize(("times_as_much", "is_chosen"), [(0.9, True), (1.1, False)])
+def test_an_archived_policy_has_to_beat_the_mode_alone_where_no_residual_is_kept(
+    reference: list[Trajectory], times_as_much: float, is_chosen: bool
+) -> None:
+    policy = archived(moved(-1.0))
+    gained = trial_of(DISLIKES, 1.0, 0.0, reference, policy.driven).preference
+    own = residual(2.0 * gained, times_as_much * gained)
+    own = replace(own, weights=own.weights.changed(residual_share=0.0))
+    chosen = choose_archived(DISLIKES, own, [policy], [], reference, lambda: reference, succeeding)
+    assert bool(chosen.weights.refined) is is_chosen
+
+
+def test_whoever_is_left_without_archived_policies_by_the_check_keeps_mode_and_residual(
     reference: list[Trajectory],
 ) -> None:
-    around = explored(archived(POLICY)).around
-    assert around
-    flat = replace(around, coefficients=np.zeros_like(around.coefficients))
+    own = residual(0.01)
     more = [replace(each, success=True) for each in collect(POLICY.mean, CHECKED, 0.0, 0)]
 
     def losing(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
         return [replace(each, success=each.scenario not in CHECKED) for each in succeeding(act, scenarios, noise, seed)]
 
-    assert choose_archived(DISLIKES, flat, [archived(moved(-1.0))], [], reference, lambda: more, losing) is None
-    assert choose_archived(DISLIKES, flat, [], [], reference, lambda: more, succeeding) is None
+    kept = choose_archived(DISLIKES, own, [archived(moved(-1.0))], [], reference, lambda: more, losing)
+    assert (kept.weights, kept.notes) == (own.weights, own.notes)
+    assert choose_archived(DISLIKES, own, [], [], reference, lambda: more, succeeding) is own
+
+
+def test_what_was_refined_for_the_person_is_not_compared_once_more(reference: list[Trajectory]) -> None:
+    own = replace(NO_MODE, weights=FilterWeights(refined=moved(-0.1).weights))
+    policies = [archived(moved(-1.0))]
+    assert choose_archived(DISLIKES, own, policies, [], reference, lambda: reference, succeeding) is own
 
 
 def test_an_archived_policy_that_loses_the_task_in_more_scenarios_is_not_the_filter(

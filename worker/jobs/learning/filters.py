@@ -128,9 +128,7 @@ def fit_stage(
     return context.store.put(result.to_bytes())
 
 
-def _choose_archived(
-    context: WorkerContext, job: Job, fit: FilterFit, draft: FilterDraft, shared: bool
-) -> FilterDraft:
+def _choose_archived(context: WorkerContext, job: Job, fit: FilterFit, draft: FilterDraft, shared: bool) -> FilterDraft:
     """The best policy refined beforehand, if better; a refinement has been compared with it when it was learned."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings

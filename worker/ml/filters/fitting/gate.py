@@ -147,7 +147,7 @@ def to_beat(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traj
 def gained(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Trajectory]) -> float:
     """The change of the learned return that the draft's mode and residual have made in the gate's scenarios."""
     share = draft.weights.residual_share
-    if not share:
+    if not (draft.weights.encoder and share):
         return to_beat(problem, draft, reference)
     return next(each.preference for each in draft.trials if not each.refined and each.residual_share == share)
 
