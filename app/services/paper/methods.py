@@ -197,7 +197,8 @@ def archived_in_words(study: Study) -> str:
     return (
         f"A filter is one of {policies} policies that had been refined by soft actor-critic beforehand for people to "
         "whom one thing matters most, in an execution mode of their own, wherever one gains more by the "
-        "learned preference than is foreseen of any execution mode of the pre-trained policy and keeps the task."
+        "learned preference than the participant's mode and residual around the pre-trained policy, and keeps the "
+        "task."
     )
 
 

@@ -23,7 +23,6 @@ from worker.ml.filters.fitting.gate import (
     gained,
     keeps_task,
     largest_forces,
-    loses_nothing,
     signal_changes,
     spread_of,
     successes,
@@ -36,8 +35,8 @@ from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mod
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.refinement_gate import ArchivedDraft, gate_refined, try_refined
 
-TRIED_IN_MODES = 5
-"""each is a drive through the gate's scenarios"""
+TRIED_IN_MODES = 10
+"""each is a drive through the gate's scenarios, and most lose the task in one or two of them"""
 NEXT_BEST = 3
 """policies that are left to be tried where the best one does not pass: each is a drive through the check's scenarios"""
 
@@ -64,10 +63,10 @@ def best_archived(
     """The draft with the archived policies that the reward model likes best, the best first; none: its mode is better.
 
     Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
-    Every trial says more of the modes around its policy, where another may be sought; where anything is lost, another
-    is sought more carefully, as the best of several tries is the luckiest, too. Each policy is returned once, in its
-    best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios;
-    ``beaten``: what has to be gained; None: what the draft's mode gains.
+    Every trial says more of the modes around its policy, where another may be sought; where more is lost than by the
+    policy alone, another is sought more carefully, as the best of several tries is the luckiest, too. Each policy is
+    returned once, in its best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the
+    gate's scenarios; ``beaten``: what has to be gained; None: what the draft's mode gains.
     """
     least = to_beat(problem, draft, reference) if beaten is None else beaten
     found, most = list[_Found](), least
@@ -86,7 +85,7 @@ def best_archived(
         weights = draft.weights.changed(refined=some.archived.policy.weights, refined_mode=mode)
         candidate = replace(draft, weights=weights)
         trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
-        is_kept = loses_nothing(trial) and keeps_task(problem, trial, reference)
+        is_kept = _loses_no_more(trial, some.trial) and keeps_task(problem, trial, reference)
         if trial.preference > least and is_kept:
             found.append(_Found(trial.preference, some.archived, ArchivedDraft(candidate, tried)))
             most = max(most, trial.preference)
@@ -172,7 +171,7 @@ def _in_modes(
         return []
     wishes = _wishes(problem, known, reference)
     return [
-        _InModes(problem, each, each.around, trial.preference, wishes)
+        _InModes(problem, each, each.around, trial, wishes)
         for each, trial in zip(archived, trials, strict=True)
         if each.around is not None
     ]
@@ -186,11 +185,11 @@ class _InModes:
         problem: FilterProblem,
         archived: ArchivedPolicy,
         around: ResponseSurface,
-        alone: float,
+        trial: GateTrial,
         wishes: FloatArray,
     ) -> None:
-        """``alone``: preference of the trial of the policy as it is; ``wishes``: (E, S) in the same unit."""
-        self.problem, self.archived, self.alone, self.wishes = problem, archived, alone, wishes
+        """``trial``: of the policy as it is; ``wishes``: (E, S) in the unit of its preference."""
+        self.problem, self.archived, self.trial, self.wishes = problem, archived, trial, wishes
         self.surface, self.forces, self.lost = around, around.forces, 0
         self._seek()
 
@@ -207,7 +206,12 @@ class _InModes:
         self.mode = _best_mode(self.problem, self.surface, self.forces, self.wishes, self.lost)
         is_new = self.mode.any() and not any(np.array_equal(self.mode, tried) for tried in self.forces.modes)
         gained = float(self.surface.predict(self.mode)[0] @ self.wishes.mean(axis=0))
-        self.foreseen = self.alone + gained if is_new else -np.inf
+        self.foreseen = self.trial.preference + gained if is_new else -np.inf
+
+
+def _loses_no_more(trial: GateTrial, alone: GateTrial) -> bool:
+    """Than the archived policy in no mode, and than the reference policy: what these lose, no mode has to win back."""
+    return trial.success_change >= min(0.0, alone.success_change) and trial.pressed <= alone.pressed
 
 
 def _foreseen(some: _InModes) -> float:
