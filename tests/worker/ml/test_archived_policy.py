@@ -146,6 +146,21 @@ def test_a_mode_that_loses_anything_is_not_begun_in_however_much_of_it_is_tolera
     assert not start.weights.refined_mode
 
 
+@pytest.mark.parametrize(("lost", "is_taken"), [(1, True), (2, False)])
+def test_a_mode_does_not_have_to_win_back_what_its_policy_alone_loses(
+    reference: list[Trajectory], lost: int, is_taken: bool
+) -> None:
+    tolerant = replace(DISLIKES, config=FilterConfig(success_tolerance=0.5))
+    plain = explored(archived(moved(-0.5)))
+    alone = replace(plain, driven=[replace(each, success=each.scenario >= 1) for each in plain.driven])
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        return [replace(each, success=each.scenario >= lost) for each in collect(act, scenarios, noise, seed)]
+
+    (start, _), *_ = best_archived(tolerant, NO_MODE, [alone], [], reference, drive)
+    assert bool(start.weights.refined_mode) is is_taken
+
+
 def test_the_most_promising_is_tried_first_and_no_more_than_somebody_can_wait_for(reference: list[Trajectory]) -> None:
     others, tried = [explored(archived(moved(by))) for by in (-0.4, *[-0.5] * TRIED_IN_MODES)], list[float]()
 
