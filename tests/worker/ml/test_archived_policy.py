@@ -20,8 +20,8 @@ from worker.ml.filters.fitting.gate import signal_changes, trial_of
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement import refinement
 from worker.ml.reinforcement.archived_policy import (
+    DRIVEN_IN_MODES,
     NEXT_BEST,
-    TRIED_IN_MODES,
     ArchivedPolicy,
     best_archived,
     choose_archived,
@@ -162,16 +162,33 @@ def test_a_mode_does_not_have_to_win_back_what_its_policy_alone_loses(
 
 
 def test_the_most_promising_is_tried_first_and_no_more_than_somebody_can_wait_for(reference: list[Trajectory]) -> None:
-    others, tried = [explored(archived(moved(by))) for by in (-0.4, *[-0.5] * TRIED_IN_MODES)], list[float]()
+    others, tried = [explored(archived(moved(by))) for by in (-0.4, *[-0.5] * DRIVEN_IN_MODES)], list[float]()
 
     def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
-        driven = failing(act, scenarios, noise, seed)
+        """Whatever is tried keeps the task, and is no better than the frozen policy."""
+        driven = collect(act, scenarios, noise, seed)
         tried.append(float(np.mean([each.actions[:, 0].mean() for each in driven])))
-        return driven
+        return succeeding(POLICY.mean, scenarios, noise, seed)
 
     best_archived(DISLIKES, NO_MODE, others, [], reference, drive)
-    assert len(tried) == TRIED_IN_MODES
+    assert len(tried) == DRIVEN_IN_MODES
     assert tried[0] == min(tried)
+
+
+def test_modes_that_lose_the_task_in_a_scenario_where_others_have_lost_it_are_driven_no_further(
+    reference: list[Trajectory],
+) -> None:
+    asked, lost = list[list[int]](), SCENARIOS[3]
+
+    def drive(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        asked.append(list(scenarios))
+        return [replace(each, success=each.scenario != lost) for each in collect(act, scenarios, noise, seed)]
+
+    best = best_archived(DISLIKES, NO_MODE, [explored(archived(moved(-0.5)))], [], reference, drive)
+    assert not best[0].draft.weights.refined_mode
+    assert asked[0] == list(SCENARIOS)
+    assert asked[1:]
+    assert all(each == [lost] for each in asked[1:])
 
 
 def test_a_policy_that_loses_the_task_is_not_driven_once_more_where_no_mode_is_better(

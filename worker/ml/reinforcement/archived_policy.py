@@ -11,10 +11,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from worker.domain.trajectory import Trajectory
-from worker.domain.type_aliases import FloatArray
+from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
@@ -22,21 +20,19 @@ from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, Rep
 from worker.ml.filters.fitting.gate import (
     gained,
     keeps_task,
-    largest_forces,
-    signal_changes,
     spread_of,
-    successes,
     to_beat,
     trial_of,
 )
-from worker.ml.filters.fitting.mode_archive import ModeForces, tail_growth_n
-from worker.ml.filters.fitting.mode_search import caution_of
-from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
+from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.gaussian import GaussianPolicy
-from worker.ml.reinforcement.refinement_gate import ArchivedDraft, gate_refined, try_refined
+from worker.ml.reinforcement.archived_in_modes import DoubtedFirst, InModes, Lost
+from worker.ml.reinforcement.refinement_gate import ArchivedDraft, gate_refined
 
-TRIED_IN_MODES = 10
-"""each is a drive through the gate's scenarios, and most lose the task in one or two of them"""
+DRIVEN_IN_MODES = 5
+"""each is a drive through all of the gate's scenarios"""
+SOUGHT_IN_MODES = 40
+"""most of which are refused after a few of these"""
 NEXT_BEST = 3
 """policies that are left to be tried where the best one does not pass: each is a drive through the check's scenarios"""
 
@@ -64,32 +60,39 @@ def best_archived(
 
     Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
     Every trial says more of the modes around its policy, where another may be sought; where more is lost than by the
-    policy alone, another is sought more carefully, as the best of several tries is the luckiest, too. Each policy is
-    returned once, in its best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the
-    gate's scenarios; ``beaten``: what has to be gained; None: what the draft's mode gains.
+    policy alone, another is sought more carefully, as the best of several tries is the luckiest, too. What has been
+    lost before is driven first, and those that lose it, too, are driven no further. Each policy is returned once, in
+    its best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios;
+    ``beaten``: what has to be gained; None: what the draft's mode gains.
     """
     least = to_beat(problem, draft, reference) if beaten is None else beaten
     found, most = list[_Found](), least
     trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
     for each, trial in zip(archived, trials, strict=True):
         if trial.preference > least and keeps_task(problem, trial, reference):
-            alone = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
-            found.append(_Found(trial.preference, each, ArchivedDraft(alone, each.driven)))
+            in_no_mode = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
+            found.append(_Found(trial.preference, each, ArchivedDraft(in_no_mode, each.driven)))
             most = max(most, trial.preference)
     explored = _in_modes(problem, archived, trials, known, reference)
-    for _ in range(TRIED_IN_MODES if explored else 0):
-        some = max(explored, key=_foreseen)
-        if some.foreseen <= most:
+    drives, whole = DoubtedFirst(problem, reference, collect), 0
+    for _ in range(SOUGHT_IN_MODES if explored else 0):
+        policy, some = max(explored, key=_foreseen)
+        if some.foreseen <= most or whole == DRIVEN_IN_MODES:
             break
         mode = problem.task.modes.named(some.mode)
-        weights = draft.weights.changed(refined=some.archived.policy.weights, refined_mode=mode)
-        candidate = replace(draft, weights=weights)
-        trial, tried = try_refined(problem, candidate, 1.0, reference, collect)
-        is_kept = _loses_no_more(trial, some.trial) and keeps_task(problem, trial, reference)
+        weights = draft.weights.changed(refined=policy.policy.weights, refined_mode=mode)
+        alone = Lost.of(problem, reference, policy.driven)
+        driven = drives.drive(act_of(problem.task.modes, problem.policy, weights.changed(gate=1.0)), alone)
+        if driven is None:
+            some.give_up()
+            continue
+        whole += 1
+        trial = trial_of(problem, 1.0, 0.0, reference, driven)
+        is_kept = not Lost.of(problem, reference, driven).exceeds(alone) and keeps_task(problem, trial, reference)
         if trial.preference > least and is_kept:
-            found.append(_Found(trial.preference, some.archived, ArchivedDraft(candidate, tried)))
+            found.append(_Found(trial.preference, policy, ArchivedDraft(replace(draft, weights=weights), driven)))
             most = max(most, trial.preference)
-        some.observe(reference, tried, is_kept=is_kept)
+        some.observe(reference, driven, is_kept=is_kept)
     return _best_of_each(found)[: 1 + NEXT_BEST]
 
 
@@ -138,81 +141,23 @@ def choose_archived(
     return replace(better, trials=trials).timed("archived", started)
 
 
-def _wishes(problem: FilterProblem, known: Sequence[Trajectory], reference: Sequence[Trajectory]) -> FloatArray:
-    """(E, S) what the reward model's members want, in the unit of a trial's preference."""
-    wanted: FloatArray = problem.reward.signal_weights(known)
-    return wanted / spread_of(problem.reward.member_returns(reference))
-
-
-def _best_mode(
-    problem: FilterProblem, surface: ResponseSurface, forces: ModeForces | None, wishes: FloatArray, lost: int = 0
-) -> FloatArray:
-    """(A,) the mode that a surface says is best; ``lost``: how many were tried that lost anything."""
-    return best_mode(
-        surface,
-        wishes,
-        problem.seed,
-        caution=caution_of(problem),
-        success_caution=problem.config.success_caution * (1 + lost),
-        forces=forces,
-        most_growth_n=problem.config.pressed_n,
-    )
-
-
 def _in_modes(
     problem: FilterProblem,
     archived: Sequence[ArchivedPolicy],
     trials: Sequence[GateTrial],
     known: Sequence[Trajectory],
     reference: Sequence[Trajectory],
-) -> list["_InModes"]:
+) -> list[tuple[ArchivedPolicy, InModes]]:
     """Those whose modes were explored."""
     if all(each.around is None for each in archived):
         return []
-    wishes = _wishes(problem, known, reference)
+    wishes = problem.reward.signal_weights(known) / spread_of(problem.reward.member_returns(reference))
     return [
-        _InModes(problem, each, each.around, trial, wishes)
+        (each, InModes(problem, each.driven, each.around, trial, wishes))
         for each, trial in zip(archived, trials, strict=True)
         if each.around is not None
     ]
 
 
-class _InModes:
-    """An archived policy, and which mode is best for it by all that is known of those around it."""
-
-    def __init__(
-        self,
-        problem: FilterProblem,
-        archived: ArchivedPolicy,
-        around: ResponseSurface,
-        trial: GateTrial,
-        wishes: FloatArray,
-    ) -> None:
-        """``trial``: of the policy as it is; ``wishes``: (E, S) in the unit of its preference."""
-        self.problem, self.archived, self.trial, self.wishes = problem, archived, trial, wishes
-        self.surface, self.forces, self.lost = around, around.forces, 0
-        self._seek()
-
-    def observe(self, reference: Sequence[Trajectory], driven: Sequence[Trajectory], *, is_kept: bool) -> None:
-        """Learn from what came of the mode in the gate's scenarios, and seek another."""
-        changes = signal_changes(self.archived.driven, driven)
-        self.surface = self.surface.with_observed(self.mode, changes, successes(driven))
-        growth_n = tail_growth_n(largest_forces(driven) - largest_forces(reference))
-        self.forces = self.forces.with_observed(self.mode, float(growth_n))
-        self.lost += not is_kept
-        self._seek()
-
-    def _seek(self) -> None:
-        self.mode = _best_mode(self.problem, self.surface, self.forces, self.wishes, self.lost)
-        is_new = self.mode.any() and not any(np.array_equal(self.mode, tried) for tried in self.forces.modes)
-        gained = float(self.surface.predict(self.mode)[0] @ self.wishes.mean(axis=0))
-        self.foreseen = self.trial.preference + gained if is_new else -np.inf
-
-
-def _loses_no_more(trial: GateTrial, alone: GateTrial) -> bool:
-    """Than the archived policy in no mode, and than the reference policy: what these lose, no mode has to win back."""
-    return trial.success_change >= min(0.0, alone.success_change) and trial.pressed <= alone.pressed
-
-
-def _foreseen(some: _InModes) -> float:
-    return some.foreseen
+def _foreseen(some: tuple[ArchivedPolicy, InModes]) -> float:
+    return some[1].foreseen

@@ -44,7 +44,7 @@ def trial_of(
     gains = np.average(after - before, axis=1, weights=_weights(outcomes))
     unit = spread_of(before)
     success = float(outcomes.mean())
-    pressed = float(_pressed(problem, reference, filtered).mean())
+    pressed = float(pressed_in(problem, reference, filtered).mean())
     return GateTrial(
         gate,
         residual_share,
@@ -124,7 +124,7 @@ def keeps_task_in_all(
     None: not clear yet, as fewer than ``within`` scenarios would change that, or forces alone are against it.
     """
     failed = float((successes(reference) - successes(filtered)).sum())
-    lost = max(failed, float(_pressed(problem, reference, filtered).sum()))
+    lost = max(failed, float(pressed_in(problem, reference, filtered).sum()))
     spare = problem.config.tolerance_in_all * len(reference) - lost
     gentle = _is_gentle(problem, _p95_force_n(filtered), reference)
     if abs(spare) < within or (within and spare > 0.0 and not gentle):
@@ -152,7 +152,7 @@ def gained(problem: FilterProblem, draft: FilterDraft, reference: Sequence[Traje
     return next(each.preference for each in draft.trials if not each.refined and each.residual_share == share)
 
 
-def _pressed(
+def pressed_in(
     problem: FilterProblem, reference: Sequence[Trajectory], filtered: Sequence[Trajectory]
 ) -> npt.NDArray[np.bool_]:
     """(N,) whether somebody is pressed much harder."""
