@@ -42,7 +42,7 @@ PRINTED_ROLLOUTS = 100
 """Episodes of the frozen policy whose transitions the printed method is trained on."""
 
 
-_BEGUN, _COMPARED = 0.05, 0.82
+_BEGUN, _COMPARED = 0.05, 0.85
 """How far a fit is when a refinement begins, and when mode and residual are compared with archived policies."""
 
 T = TypeVar("T")

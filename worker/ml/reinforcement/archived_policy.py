@@ -17,13 +17,7 @@ from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.exported.shield import untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
-from worker.ml.filters.fitting.gate import (
-    gained,
-    keeps_task,
-    spread_of,
-    to_beat,
-    trial_of,
-)
+from worker.ml.filters.fitting.gate import gained, keeps_task, spread_of, to_beat, trial_of
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.reinforcement.archived_in_modes import DoubtedFirst, InModes, Lost
