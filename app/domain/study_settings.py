@@ -329,7 +329,8 @@ class StudySettings(BaseModel):
         (50,),
         Section.LEARNING,
         "Also train a filter after",
-        "Numbers of answers, with commas. One is always trained at the end; its refinement comes before earlier ones.",
+        "Numbers of answers, with commas. One is always trained at the end, and sought longer than these; its "
+        "refinement comes before earlier ones.",
         unit="answers",
         simulated=True,
     )

@@ -314,6 +314,20 @@ def test_policies_that_were_refined_beforehand_are_told_of_where_filters_may_be_
     assert re.findall(r"A filter is one of (\d+) policies that had been refined", said) == policies
 
 
+@pytest.mark.parametrize(
+    ("method", "milestones", "is_told"),
+    [(Method.STUDIO, (50,), True), (Method.STUDIO, (), False), (Method.PRINTED, (50,), False)],
+)
+def test_how_filters_of_fewer_answers_were_found_is_told_where_there_were_any(
+    experimenter: TestClient, database: Database, method: Method, milestones: tuple[int, ...], is_told: bool
+) -> None:
+    with database.writing() as session:
+        settings = PAPER_PROTOCOL.model_copy(update={"method": method, "filter_milestones": milestones})
+        study = studies.create_study(session, "On the way", settings, seed=1)
+    said = text_of(experimenter, study, "results/methods_and_results.md")
+    assert ("For the filters of fewer than all answers no residual was learned" in said) == is_told
+
+
 @pytest.mark.parametrize("path", ["results/methods_and_results.md", "preregistration.md"])
 def test_a_task_without_such_policies_is_not_told_of_any(
     experimenter: TestClient, database: Database, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, path: str

@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +102,10 @@ def _draft(task: str, number: int, bench: BenchmarkUser, kept: Path) -> FilterDr
         study_seed=number,
         version=len(PAPER_PROTOCOL.milestones),
     )
-    for ahead in (fit._gate_reference, fit._check_reference, fit._home_reference, partial(fit._archived, 0.0)):
+    for ahead in (fit._gate_reference, fit._check_reference):
         ahead()  # as a worker does while people answer
+    fit._home_reference(fit.progress)
+    fit._archived(fit.progress)
     started = time.process_time()
     pool = bench.setting().pool
     draft = fit.gate_residual(fit.train_residual(fit.find_mode(pool)))

@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.retraining --output docs/results/retraining
 
-Per task: 200 answers of a scripted user, then twice what the worker does after a milestone: reward model, mode,
-residual, gates, archived policies, promise about harm, 100 unseen scenarios, ONNX export, bundle. Beforehand what the
-worker does while people answer: it makes rollouts that are the same for everybody, in one process behind everything
+Per task: 200 answers of a scripted user, then what the worker does after an early milestone and after the last:
+reward model, all stages of the filter, promise about harm, 100 unseen scenarios, ONNX export, bundle. Beforehand what
+the worker does while people answer: it makes rollouts that are the same for everybody, in one process behind everything
 else. Run it alone on the machine: these are plain seconds.
 """
 
@@ -12,7 +12,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from app.installed_tasks import catalogue
 from tests.benchmarks import result_tables
 from worker.analysis.comparison import result_pages
 from worker.analysis.filters.promise import Outcome
-from worker.compute import filter_finishing, learning
+from worker.compute import filter_finishing, learning, stages
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Compute, Lane
 from worker.domain.trajectory import Trajectory
@@ -33,10 +33,13 @@ from worker.experiments.benchmark_cell import BenchmarkConfig, BenchmarkUser, Ce
 from worker.experiments.rollout_cache import RolloutCache
 from worker.jobs.learning.reference_rollouts import make_ready
 from worker.ml.export.bundle import Provenance
+from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.teachers import TASTES
 
-STAGES = ("reward", "mode", "residual", "gates", "archived", "promise", "evaluation_and_bundle")
+STAGES = ("reward", "quick", "mode", "residual", "gate", "archived", "promise", "evaluation_and_bundle")
+FILTERS = {"quick": stages.QUICK, "last": stages.LAST}
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
 
 
@@ -69,7 +72,9 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
             compute.warm_up(lane, partial(learning.warm_up, task))
         make_ready(compute, references, outcomes, task, PAPER_PROTOCOL, 0)
         ahead = round(time.perf_counter() - started, 1)
-        runs = [{**_run(task, user, bench, compute, references, outcomes), "made_ready": ahead} for _ in range(2)]
+        runs = [
+            {**_run(task, user, bench, compute, references, outcomes, each), "made_ready": ahead} for each in FILTERS
+        ]
     finally:
         compute.close()
     return runs
@@ -82,15 +87,16 @@ def _run(
     compute: Compute,
     references: dict[tuple[str, range], list[Trajectory]],
     outcomes: dict[tuple[str, int], list[Outcome]],
+    which: str,
 ) -> dict[str, Any]:
-    marks = [time.perf_counter()]
+    seconds, begun = dict.fromkeys(STAGES, 0.0), time.perf_counter()
 
-    def mark() -> None:
-        marks.append(time.perf_counter())
+    def measured(stage: str, started: float) -> None:
+        seconds[stage] = round(time.perf_counter() - started, 2)
 
     answers = (bench.labelled, bench.targets.astype(np.float32), bench.scale, 0)
     reward, _ = compute.run(Lane.REWARDS, _no_beat, learning.fit_reward, task, "structured", *answers)
-    mark()
+    measured("reward", begun)
     fitting = FilterFit(
         task,
         compute,
@@ -100,30 +106,36 @@ def _run(
         FilterConfig(),
         progress=lambda stage, share: None,
         references=references,
-        version=len(PAPER_PROTOCOL.milestones),
+        version=len(PAPER_PROTOCOL.milestones) if which == "last" else 1,
         outcomes=outcomes,
+        stages=FILTERS[which],
     )
     pool = bench.setting().pool
-    draft = fitting.find_mode(pool)
-    mark()
-    draft = fitting.train_residual(draft)
-    mark()
-    draft = fitting.gate_residual(draft)
-    mark()
-    draft = fitting.choose_archived(draft, pool)
-    mark()
-    draft = fitting.keep_promise(draft)
-    mark()
+    by_stage: dict[str, Callable[[FilterDraft], FilterDraft]] = {
+        "quick": lambda _: fitting.find_quickly(pool, archived=True),
+        "mode": lambda _: fitting.find_mode(pool),
+        "residual": fitting.train_residual,
+        "gate": fitting.gate_residual,
+        "archived": lambda draft: fitting.choose_archived(draft, pool),
+        "promise": fitting.keep_promise,
+    }
+    draft = FilterDraft(FilterWeights())
+    for stage in stages.before_finish(fitting.stages):
+        started = time.perf_counter()
+        draft = by_stage[stage](draft)
+        measured(stage, started)
+    started = time.perf_counter()
     finished = filter_finishing.finish(fitting, draft, PROVENANCE, {})
-    mark()
-    seconds = {name: round(marks[index + 1] - marks[index], 2) for index, name in enumerate(STAGES)}
+    measured("evaluation_and_bundle", started)
     evaluation = finished.metrics["evaluation"]
     return {
         "task": task,
         "user": user,
+        "filter": which,
         "tried": sum(trial.residual_share == 0.0 for trial in draft.trials),
         **seconds,
-        "seconds": round(marks[-1] - marks[0], 1),
+        "seconds": round(time.perf_counter() - begun, 1),
+        "archived_policy": bool(draft.weights.refined),
         "success_delta": round(evaluation["success"]["delta"], 3),
         "promise_tests": ", ".join(_in_words(test) for test in draft.promise["tests"]),
     }

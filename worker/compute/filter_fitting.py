@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from worker.analysis.filters.promise import Outcome, Promise
-from worker.compute import harm_tests, learning, refining, simulation
+from worker.compute import harm_tests, learning, refining, simulation, stages
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
+from worker.compute.stages import Stages
 from worker.domain.lab_modes import PolicyChoice
 from worker.domain.scenarios import RESIDUAL, first_of, of_promise
 from worker.domain.trajectory import Trajectory
@@ -29,6 +30,7 @@ from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.policies.checkpoint import Checkpoint
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy, best_archived, choose_archived
+from worker.ml.reinforcement.quick_filter import quick_filter
 from worker.ml.reinforcement.refinement import Refinement, is_promising
 from worker.ml.reinforcement.refinement_gate import gate_refined
 from worker.ml.rewards.loading import load_reward_model
@@ -41,9 +43,6 @@ CHUNK = 3
 PRINTED_ROLLOUTS = 100
 """Episodes of the frozen policy whose transitions the printed method is trained on."""
 
-
-_BEGUN, _COMPARED = 0.05, 0.85
-"""How far a fit is when a refinement begins, and when mode and residual are compared with archived policies."""
 
 T = TypeVar("T")
 TrainPatiently = Callable[[Callable[[Path], T]], T | None]
@@ -74,6 +73,12 @@ class FilterFit:
     """of this person's filters"""
     outcomes: dict[tuple[str, int], list[Outcome]] = field(default_factory=dict)
     """of the frozen policy, by task and first scenario"""
+    stages: Stages = field(default_factory=lambda: stages.LAST)
+    """what is to be done, for ``progress`` to hear how much of it is"""
+
+    def during(self, stage: str) -> ReportProgress:
+        """What hears how far this stage is, from 0 to 1."""
+        return stages.during(self.stages, stage, self.progress)
 
     @property
     def problem(self) -> FilterProblem:
@@ -85,38 +90,46 @@ class FilterFit:
     def find_mode(self, pool: Pool) -> FilterDraft:
         """The person's execution mode, as far as held-out scenarios allow it; or their policy among several."""
         if isinstance(self.problem.task.modes, PolicyChoice):
-            return self._choose(self.problem.task.modes)
-        reference = self._gate_reference()
-        return mode_search.find_mode(self.problem, self._surface(), pool, reference, self.collect, self.progress)
+            return self._choose(self.problem.task.modes, self.during("mode"))
+        reference, progress = self._gate_reference(), self.during("mode")
+        return mode_search.find_mode(self.problem, self._surface(), pool, reference, self.collect, progress)
+
+    def find_quickly(self, pool: Pool, *, archived: bool) -> FilterDraft:
+        """What can be had in a minute, while the person still answers: quick_filter().
+
+        ``archived``: whether policies that were refined beforehand come into question.
+        """
+        if isinstance(self.problem.task.modes, PolicyChoice):
+            return self._choose(self.problem.task.modes, self.during("quick"))
+        policies = self._archived(self.during("quick")) if archived else []
+        reference, progress = self._gate_reference(), self.during("quick")
+        return quick_filter(self.problem, self._surface(), pool, policies, reference, self.collect, progress)
 
     def choose_archived(self, draft: FilterDraft, pool: Pool) -> FilterDraft:
         """The policy refined beforehand that is best for the person, if it is better than mode and residual."""
-        problem, archived, reference = self.problem, self._archived(_COMPARED), self._gate_reference()
-
-        def progress(stage: str, _: float) -> None:
-            self.progress(stage, _COMPARED)
-
+        problem, progress = self.problem, self.during("archived")
+        archived, reference = self._archived(progress), self._gate_reference()
         more_reference, known = self._check_reference, pool.rollouts
         return choose_archived(problem, draft, archived, known, reference, more_reference, self.collect, progress)
 
-    def _choose(self, family: PolicyChoice) -> FilterDraft:
+    def _choose(self, family: PolicyChoice, progress: ReportProgress) -> FilterDraft:
         """What every policy does in the gate's scenarios is the same for everybody, and made once per worker."""
         scenarios = self.problem.config.gate_block(self.problem.task)
         others = {}
         for number, name in enumerate(family.names):
-            self.progress(f"driving the policy {name} through held-out scenarios", 0.6 * number / len(family.names))
+            progress(f"driving the policy {name} through held-out scenarios", number / len(family.names))
             others[name] = self.reference(scenarios, name)
         return policy_choice.choose(self.problem, self.reference(scenarios), others)
 
     def train_residual(self, draft: FilterDraft) -> FilterDraft:
         """The residual action encoder around the mode."""
-        return residual.train_residual(self.problem, draft, self.collect, self.progress, self._learn)
+        return residual.train_residual(self.problem, draft, self.collect, self.during("residual"), self._learn)
 
     def gate_residual(self, draft: FilterDraft) -> FilterDraft:
         """As much of the residual as held-out scenarios allow."""
-        reference = self._gate_reference()
-        home = self._home_reference
-        return residual_gate.gate_residual(self.problem, draft, reference, home, self.collect, self.progress)
+        reference, progress = self._gate_reference(), self.during("gate")
+        home = partial(self._home_reference, progress)
+        return residual_gate.gate_residual(self.problem, draft, reference, home, self.collect, progress)
 
     def refine(
         self,
@@ -139,12 +152,15 @@ class FilterFit:
             if not drafts:
                 return None
         archived, reference, more_reference = training.archived, training.reference, self._check_reference
-        return gate_refined(
-            self.problem, draft, archived, drafts, reference, more_reference, self.collect, self.progress
-        )
+        during = self.during("refinement")
+
+        def progress(stage: str, share: float) -> None:
+            during(stage, stages.TRAINED + (1.0 - stages.TRAINED) * share)
+
+        return gate_refined(self.problem, draft, archived, drafts, reference, more_reference, self.collect, progress)
 
     def _is_promising(self, training: refining.Training, begun: Path) -> bool:
-        self.progress("checking what the refinement has come to", 0.34)
+        self.during("refinement")("checking what the refinement has come to", 0.0)
         draft, reference, checkpoint = training.start.draft, training.reference, Checkpoint(begun)
         return is_promising(self.problem, draft, reference, training.config, checkpoint, self.collect)
 
@@ -160,15 +176,13 @@ class FilterFit:
         """``watched``: whether it is tried on the way, as it is until refine_ahead() is done."""
         looks = self.reference(self.problem.config.watch_block(self.problem.task)) if watched else ()
         reference, config = self._gate_reference(), Refinement(steps)
-        archived = best_archived(self.problem, mode, self._archived(_BEGUN), known, reference, self.collect)
+        policies = self._archived(self.during("refinement"))
+        archived = best_archived(self.problem, mode, policies, known, reference, self.collect)
         return refining.Training(self.task, self.problem, mode, archived, known, reference, looks, config)
 
-    def _archived(self, share: float) -> list[ArchivedPolicy]:
-        """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker.
-
-        ``share``: of the fit that is done.
-        """
-        self.progress("looking at policies that were refined beforehand", share)
+    def _archived(self, progress: ReportProgress) -> list[ArchivedPolicy]:
+        """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
+        progress("looking at policies that were refined beforehand", 0.0)
         scenarios, archived = self.problem.config.gate_block(self.problem.task), []
         for name, policy in simulation.archived_policies(self.task).items():
             driven = self._driven(driven_as(self.task, name), policy, scenarios)
@@ -180,16 +194,20 @@ class FilterFit:
 
     def keep_promise(self, draft: FilterDraft) -> FilterDraft:
         """The filter behind its shield, as far as the promise about harm can be made of it."""
-        draft = draft.shielded(self.problem.task.observation, self._home_reference)
+        progress = self.during("promise")
+        draft = draft.shielded(self.problem.task.observation, partial(self._home_reference, progress))
         if draft.weights.moves_nothing:
             return harm_tests.untested(draft, self.promise, self.version)
         started = time.perf_counter()
         chooses = isinstance(self.problem.task.modes, PolicyChoice)  # there is no half of another policy
         strengths = harm_tests.STRENGTHS[: 1 if chooses else None]
         scenarios = of_promise(self.study_seed)
+        driven, usual = 0, self.promise.needed(self.promise.error_of(0, self.version))
 
         def drive(weights: FilterWeights, some: range) -> Sequence[Outcome]:
-            self.progress("testing what the filter may do to people", 0.86)
+            nonlocal driven
+            progress("testing what the filter may do to people", driven / (driven + usual))
+            driven += len(some)
             return self._outcomes(self.act_of(weights), some)
 
         kept = harm_tests.weakened_until_promised(
@@ -216,7 +234,7 @@ class FilterFit:
     def fit_printed(self) -> FilterDraft:
         """The paper's PbARL as printed, on transitions of the frozen policy. Not gated: it is what it is."""
         transitions = self.reference(first_of(RESIDUAL, PRINTED_ROLLOUTS))
-        self.progress("training the printed action encoder", 0.1)
+        self.during("printed")("training the printed action encoder", 0.0)
         return self.compute.run(Lane.LEARNING, self.beat, printed_filter.fit_printed, self.problem, transitions)
 
     def collect(self, act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
@@ -235,10 +253,10 @@ class FilterFit:
     def _check_reference(self) -> Sequence[Trajectory]:
         return self.reference(self.problem.config.check_block(self.problem.task))
 
-    def _home_reference(self) -> Sequence[Trajectory]:
+    def _home_reference(self, progress: ReportProgress) -> Sequence[Trajectory]:
         scenarios = self.problem.config.home_block(self.problem.task)
         if (self.task, scenarios) not in self.references:
-            self.progress("driving the reference policy, whose reach the shield has to know", 0.85)
+            progress("driving the reference policy, whose reach the shield has to know", 0.0)
         return self.reference(scenarios)
 
     def act_of(self, weights: FilterWeights) -> FilterAct:

@@ -177,6 +177,7 @@ def _procedure(session: Session, study: Study) -> Iterator[str]:
         if study.material is None
         else "",
         archived_in_words(study),
+        _quickly_in_words(study),
         "The filter of all answers was then refined by soft actor-critic for "
         f"{settings.refinement_steps:,} environment steps, {percent(SHARE_AHEAD, 0)} of them on the preference learned "
         f"from the first {answers_ahead(settings.labels_per_participant)} answers and from its execution mode on; "
@@ -199,6 +200,18 @@ def archived_in_words(study: Study) -> str:
         "whom one thing matters most, in an execution mode of their own, wherever one gains more by the "
         "learned preference than the participant's mode and residual around the pre-trained policy, and keeps the "
         "task."
+    )
+
+
+def _quickly_in_words(study: Study) -> str:
+    """How filters were found that followed some of the answers."""
+    settings = study.settings
+    if study.material is not None or settings.method is not Method.STUDIO or len(settings.milestones) == 1:
+        return ""
+    instead = ", or one of these policies in no mode where that gains more" if archived_policy_count(study.task) else ""
+    return (
+        "For the filters of fewer than all answers no residual was learned, and the first execution mode was taken "
+        f"that was better and kept the task{instead}."
     )
 
 

@@ -13,7 +13,7 @@ import torch
 from tests.worker import invented
 from tests.worker.at_hand import AtHand
 from worker.analysis.filters.promise import Outcome
-from worker.compute import filter_finishing, filter_fitting, learning, simulation
+from worker.compute import filter_finishing, filter_fitting, learning, simulation, stages
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.compute.refining import Training
@@ -133,7 +133,9 @@ def test_who_waits_for_the_rest_does_not_wait_for_scenarios_of_looks(
     Checkpoint(tmp_path).write({"a": torch.zeros(1)}, {"steps": made})
     task = registry.task("feeding")
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
-    fit = FilterFit("feeding", compute, lambda: None, reward, 0, config, lambda stage, share: None, {})
+    fit = FilterFit(
+        "feeding", compute, lambda: None, reward, 0, config, lambda stage, share: None, {}, stages=stages.REFINED
+    )
 
     def nobody_needs_it(part: Callable[[Path], Sequence[FilterDraft]]) -> None: ...
 
@@ -153,7 +155,17 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
     monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
     monkeypatch.setattr(filter_fitting, "best_archived", lambda *_: best)
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
-    fit = FilterFit("feeding", Drives(), lambda: None, reward, 0, FilterConfig(), lambda stage, share: None, {})
+    fit = FilterFit(
+        "feeding",
+        Drives(),
+        lambda: None,
+        reward,
+        0,
+        FilterConfig(),
+        lambda stage, share: None,
+        {},
+        stages=stages.REFINED,
+    )
 
     def noted(part: Callable[[Path], Sequence[FilterDraft]]) -> None:
         assert isinstance(part, partial)
@@ -184,6 +196,15 @@ def test_what_archived_policies_do_is_driven_once_for_everybody(monkeypatch: pyt
     count = len(scenarios.gate_block(invented.TASK))
     for wish in (1.0, -1.0):
         reward = StructuredReward(np.full((1, len(SIGNALS)), wish)).to_bytes()
-        fit = FilterFit("feeding", compute, lambda: None, reward, 0, scenarios, lambda stage, share: None, references)
+        fit = FilterFit(
+            "feeding",
+            compute,
+            lambda: None,
+            reward,
+            0,
+            scenarios,
+            lambda stage, share: None,
+            references,
+        )
         fit.choose_archived(FilterDraft(FilterWeights()), Pool([], []))
         assert [compute.driven[each] for each in policies.values()] == [count, count]

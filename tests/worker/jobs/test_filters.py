@@ -1,6 +1,6 @@
 """When a filter is trained, and when not."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -12,11 +12,13 @@ import torch
 from sqlalchemy import func, select
 
 from app.db import Database
+from app.domain.choices import Method
 from app.domain.clips import Clip, Rollout
 from app.domain.models import Model, ModelKind, RunKind
 from app.domain.preferences import LabelEvent, Query, Response
 from app.domain.run_keys import RunKey
 from app.domain.studies import Participant, Study
+from app.domain.study_settings import StudySettings
 from app.installed_tasks.refinements import SHORTEST_REFINEMENT
 from app.services.answers import accuracy
 from app.services.answers.misfit import Misfit
@@ -32,7 +34,6 @@ from worker.jobs.learning.filters import (
     notes_on_misfit,
     train_filter,
 )
-from worker.jobs.learning.fits import is_refined
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
 from worker.jobs.runtime.due_work import answers_known, is_outdated
@@ -154,20 +155,29 @@ def test_after_the_last_answer_an_earlier_filter_is_not_even_finished(
     assert not outdated_at(context, participant, 20, begun=True)
 
 
-def test_only_the_filter_of_all_answers_and_those_for_several_people_are_refined(
+def test_only_the_filter_of_all_answers_and_those_for_several_people_are_sought_long_and_refined(
     context: WorkerContext, participant: Participant
 ) -> None:
     with context.database.reading() as session:
         settings = session.get_one(Study, participant.study_id).settings
     wanted = settings.model_copy(update={"refinement_steps": SHORTEST_REFINEMENT})
-    early, last = (
-        Job(RunKey(RunKind.FILTER, participant_id=participant.id, labels=labels), participant.study_id)
-        for labels in (10, settings.labels_per_participant)
-    )
-    assert is_refined(wanted, last, shared=False)
-    assert is_refined(wanted, early, shared=True)
-    assert not is_refined(wanted, early, shared=False)
-    assert not is_refined(settings, last, shared=True)
+    printed = settings.model_copy(update={"method": Method.PRINTED})
+
+    def done(chosen: StudySettings, kind: RunKind, labels: int) -> Collection[str]:
+        key = RunKey(kind, participant_id=participant.id, labels=labels)
+        return fits.stages_of(chosen, Job(key, participant.study_id))
+
+    early, last = 10, settings.labels_per_participant
+    for chosen in (settings, wanted):
+        assert "quick" in done(chosen, RunKind.FILTER, early)
+        assert not {"refinement", "residual", "archived"} & set(done(chosen, RunKind.FILTER, early))
+    assert {"residual", "archived"} <= set(done(settings, RunKind.FILTER, last))
+    assert "refinement" not in done(settings, RunKind.FILTER, last)
+    assert "refinement" not in done(settings, RunKind.SHARED, early)
+    for kind, labels in ((RunKind.FILTER, last), (RunKind.SHARED, early), (RunKind.REFINEMENT, early)):
+        assert "refinement" in done(wanted, kind, labels)
+        assert "archived" not in done(wanted, kind, labels), "it was compared with them when it was learned"
+    assert list(done(printed, RunKind.FILTER, early)) == list(done(printed, RunKind.FILTER, last))
 
 
 WHOLE = Refinement(SHORTEST_REFINEMENT).ahead_steps
@@ -330,36 +340,30 @@ OWN = FilterDraft(FilterWeights(), notes=("mode and residual",))
 ARCHIVED = FilterDraft(FilterWeights(), notes=("archived",))
 
 
-@pytest.mark.parametrize(
-    ("answers", "steps", "evidence", "made"),
-    [
-        (20, 0, 1.9, "archived"),
-        (20, 0, 2.1, "not refined"),
-        (10, SHORTEST_REFINEMENT, 1.9, "archived"),
-        (20, SHORTEST_REFINEMENT, 1.9, "mode and residual"),
-    ],
-    ids=["the usual", "doubted", "an earlier filter", "it was learned on from"],
-)
-def test_a_filter_is_compared_with_archived_policies_where_the_answers_are_understood_and_nothing_was_refined(
+@pytest.mark.parametrize(("evidence", "made"), [(1.9, "archived"), (2.1, "not refined")], ids=["the usual", "doubted"])
+@pytest.mark.parametrize(("stage", "answers"), [("archived", 20), ("quick", 10)])
+def test_a_filter_is_compared_with_archived_policies_where_the_answers_are_understood(
     context: WorkerContext,
     participant: Participant,
     answered: Callable[[int], None],
     refining: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
+    stage: str,
     answers: int,
-    steps: int,
     evidence: float,
     made: str,
 ) -> None:
     answered(answers)
     misfit = {"misfit": {"evidence": evidence, "explanation": "arrival"}, "further": ""}
     save_model(context, participant, ModelKind.REWARD, "all labels", misfit)
-    refining(go_on, choose_archived=lambda own, pool: ARCHIVED, task="feeding")
+    refining(
+        go_on,
+        choose_archived=lambda own, pool: ARCHIVED,
+        find_quickly=lambda pool, archived: ARCHIVED if archived else OWN,
+        task="feeding",
+    )
     monkeypatch.setattr(fits, "load_draft", lambda *_: OWN)
-    with context.database.writing() as session:
-        study = session.get_one(Study, participant.study_id)
-        study.stored_settings = {**study.stored_settings, "refinement_steps": steps}
     _, run_id = begin(context, participant, RunKind.FILTER)
     job = filter_at(context, participant, answers)
-    draft = fit_stage(context, run_id, job, context.store.put(b"reward"), "of mode and residual", "archived")
+    draft = fit_stage(context, run_id, job, context.store.put(b"reward"), "of mode and residual", stage)
     assert made in FilterDraft.from_bytes(context.store.read(draft)).notes[-1]

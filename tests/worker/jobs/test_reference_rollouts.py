@@ -55,7 +55,7 @@ def test_they_are_those_a_filter_would_make_for_itself(context: WorkerContext) -
     for scenarios in reference_blocks("feeding", SETTINGS):
         assert [each.scenario for each in fitting(context).reference(scenarios)] == list(scenarios)
     gate, *_ = reference_blocks("feeding", SETTINGS)
-    for archived in fitting(context)._archived(0.0):
+    for archived in fitting(context)._archived(lambda stage, share: None):
         assert [each.scenario for each in archived.driven] == list(gate)
     drawn = promise_block(SETTINGS, 5)
     assert fitting(context)._reference_outcomes(drawn) == context.outcomes["feeding", drawn.start]

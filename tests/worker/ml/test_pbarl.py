@@ -1,7 +1,7 @@
 """The stages of the studio's filter on an invented world in which speed is the size of the actions."""
 
 import pickle
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,9 @@ from worker.domain.trajectory import SIGNALS, Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
-from worker.ml.filters.fitting import mode_search, pbarl, residual, response_surface
+from worker.ml.filters.fitting import mode_search, pbarl, residual, residual_gate, response_surface
 from worker.ml.filters.fitting.filter_draft import FilterDraft
-from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem
+from worker.ml.filters.fitting.filter_problem import FilterConfig, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.gate import trial_of, try_on
 from worker.ml.filters.fitting.mode_archive import ModeArchive
 from worker.ml.filters.fitting.pool import Pool
@@ -126,24 +126,51 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
     weight: float, direction: int, reference: list[Trajectory], surface: ResponseSurface
 ) -> None:
     torch.set_num_threads(1)
-    told: list[tuple[str, float]] = []
-    world = World()
-    draft = pbarl.fit_studio(
-        problem(weight, reference),
-        surface,
-        Pool(),
-        reference,
-        no_more,
-        world.collect,
-        lambda stage, share: told.append((stage, share)),
-    )
+    draft = pbarl.fit_studio(problem(weight, reference), surface, Pool(), reference, no_more, World().collect)
     plain = float(np.mean([each.signals[:, SPEED].mean() for each in World().collect(POLICY.mean, range(20), 0.0, 0)]))
     assert direction * (speed_of(draft) - plain) > 0.1 * plain
     assert draft.weights.gate == 1.0
-    shares = [share for _, share in told]
-    assert shares == sorted(shares)
     assert set(draft.seconds) == {"mode", "residual_rollouts", "residual_learning", "gate_residual"}
     assert pickle.loads(pickle.dumps(draft)).weights.mode == draft.weights.mode  # noqa: S301
+
+
+def test_every_stage_says_how_far_it_is(reference: list[Trajectory], surface: ResponseSurface) -> None:
+    torch.set_num_threads(1)
+    asked, collect, draft = problem(1.0, reference, residual_rounds=3), World().collect, FilterDraft(FilterWeights())
+    stages: tuple[Callable[[ReportProgress], FilterDraft], ...] = (
+        lambda say: mode_search.find_mode(asked, surface, Pool(), reference, collect, say),
+        lambda say: residual.train_residual(asked, draft, collect, say),
+        lambda say: residual_gate.gate_residual(asked, draft, reference, no_more, collect, say),
+    )
+    for stage in stages:
+        shares = list[float]()
+        draft = stage(lambda _, share, shares=shares: shares.append(share))  # type: ignore[misc]
+        assert len(set(shares)) > 1
+        assert shares == sorted(shares)
+        assert shares[0] == 0.0
+        assert shares[-1] < 1.0
+
+
+def test_who_cannot_wait_gets_the_first_mode_that_will_do(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    asked, world = problem(-1.0, reference), World()
+    found = mode_search.find_mode_quickly(asked, surface, Pool(), reference, world.collect, 0.0)
+    assert len(world.asked) == 1, "what is foreseen is so"
+    assert found.trials[-1].preference > 0.0
+    assert found.weights.gate == 1.0
+    assert mode_search.find_mode_quickly(asked, surface, Pool(), reference, world.collect, 1e6).weights.moves_nothing
+    assert len(world.asked) == 1, "no mode is driven of which no more is foreseen than there is"
+
+
+def test_who_cannot_wait_gets_less_of_a_mode_that_presses(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    found = mode_search.find_mode_quickly(
+        problem(-1.0, reference, gates=(0.4, 0.1)), surface, Pool(), reference, pressing, 0.0
+    )
+    assert found.weights.gate < 1.0
+    assert found.trials[-1].pressed == 0.0
 
 
 def test_a_mode_that_fails_the_task_is_turned_off(reference: list[Trajectory], surface: ResponseSurface) -> None:

@@ -15,7 +15,7 @@ from app.services.answers.misfit import CHANGING, Misfit, doubt_of
 from app.services.exports.export_formats import provenance_of
 from app.services.monitoring import dashboard
 from app.services.participants import visits
-from worker.compute import filter_finishing, learning, simulation
+from worker.compute import filter_finishing, learning, simulation, stages
 from worker.compute.filter_fitting import FilterFit
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, refinement
@@ -25,11 +25,6 @@ from worker.jobs.runtime.records import Job
 from worker.ml.export import bundle
 from worker.ml.export.bundle import Provenance
 from worker.ml.filters.fitting.filter_draft import FilterDraft
-
-STAGES = {
-    Method.STUDIO: ("mode", "refinement", "residual", "gate", "archived", "promise"),
-    Method.PRINTED: ("printed",),
-}
 
 
 class NothingToLearnFrom(AppError):
@@ -50,7 +45,7 @@ def train_filter(context: WorkerContext, job: Job, run_id: int, step: Step) -> N
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
     draft = ""
-    for stage in STAGES[settings.method]:
+    for stage in stages.before_finish(fits.stages_of(settings, job)):
         if step(f"is-outdated-before-{stage}", is_outdated, context, job, True):
             return
         draft = step(stage, fit_stage, context, run_id, job, reward, draft, stage)
@@ -116,23 +111,30 @@ def fit_stage(
     if stage == "refinement":
         return refinement.refine(context, run_id, job, reward, draft, shared)
     fit = fits.fitting(context, run_id, job, context.store.read(reward), shared=shared)
-    if stage == "mode":
+    if stage == "quick":
+        result = _find_quickly(context, job, fit)
+    elif stage == "mode":
         result = fit.find_mode(fits.pool_of(context, job))
     elif stage == "printed":
         result = fit.fit_printed()
     elif stage == "archived":
         result = _choose_archived(context, job, fit, fits.load_draft(context, draft), shared)
     else:
-        stages = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
-        result = stages[stage](fits.load_draft(context, draft))
+        by_name = {"residual": fit.train_residual, "gate": fit.gate_residual, "promise": fit.keep_promise}
+        result = by_name[stage](fits.load_draft(context, draft))
     return context.store.put(result.to_bytes())
 
 
+def _find_quickly(context: WorkerContext, job: Job, fit: FilterFit) -> FilterDraft:
+    """A policy refined beforehand goes further than what is not understood can be followed."""
+    doubt = refinement.unlearned_doubt(context, job)
+    draft = fit.find_quickly(fits.pool_of(context, job), archived=doubt is None)
+    return refinement.unrefined(draft, doubt) if doubt and simulation.archived_policies(fit.task) else draft
+
+
 def _choose_archived(context: WorkerContext, job: Job, fit: FilterFit, draft: FilterDraft, shared: bool) -> FilterDraft:
-    """The best policy refined beforehand, if better; a refinement has been compared with it when it was learned."""
-    with context.database.reading() as session:
-        settings = session.get_one(Study, job.study_id).settings
-    if fits.is_refined(settings, job, shared) or not simulation.archived_policies(fit.task):
+    """The best policy refined beforehand, if better."""
+    if not simulation.archived_policies(fit.task):
         return draft
     doubt = None if shared else refinement.unlearned_doubt(context, job)
     if doubt:

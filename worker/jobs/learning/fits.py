@@ -1,9 +1,13 @@
 """What fits filters, as a study and a person have it: settings, seeds, the pool; and how far a fit is."""
 
+from app.domain.choices import Method
+from app.domain.models import RunKind
 from app.domain.studies import Participant, Study
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Promise
+from worker.compute import stages
 from worker.compute.filter_fitting import FilterFit
+from worker.compute.stages import Stages
 from worker.jobs.learning import dataset
 from worker.jobs.runtime import records
 from worker.jobs.runtime.context import WorkerContext
@@ -12,30 +16,20 @@ from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.pool import Pool
 
-_BEFORE, _AFTER = 0.15, 0.7
-"""How far a fit is before its refinement and after it."""
-_MODE = 0.35
-"""How far a fit without one is when it has its mode."""
-
 PRESSED_SHARE = 0.7
 """Of the share of scenarios that may be harmed: what a gate lets pass, so that most of it can be promised."""
 
 
-def is_refined(settings: StudySettings, job: Job, shared: bool) -> bool:
-    """Filters of all answers are, and those for several people (``shared``), which others are compared with."""
-    return settings.refinement_steps > 0 and (shared or (job.about.labels or 0) >= settings.labels_per_participant)
+def stages_of(settings: StudySettings, job: Job) -> Stages:
+    """What is done for a filter: less for a person's own who still answers, and is soon given the next.
 
-
-def refining(share: float) -> float:
-    """What is done of a fit when this share of its refinement is."""
-    return _BEFORE + (_AFTER - _BEFORE) * share
-
-
-def _beside(share: float) -> float:
-    """What is done of a fit with a refinement, when this share of it would be done without one."""
-    if share < _MODE:
-        return _BEFORE * share / _MODE
-    return _AFTER + (1.0 - _AFTER) * (share - _MODE) / (1.0 - _MODE)
+    Filters for several people are compared with the last ones, and what is made ahead of these begins as they do.
+    """
+    if job.kind == RunKind.FILTER and settings.method is Method.PRINTED:
+        return stages.PRINTED
+    if job.kind == RunKind.FILTER and (job.about.labels or 0) < settings.labels_per_participant:
+        return stages.QUICK
+    return stages.REFINED if settings.refinement_steps else stages.LAST
 
 
 def pool_of(context: WorkerContext, job: Job) -> Pool:
@@ -79,7 +73,6 @@ def fitting(context: WorkerContext, run_id: int, job: Job, reward: bytes, *, sha
         study_seed = study.seed
         seed = study_seed if shared else session.get_one(Participant, job.participant).seed
         version = 1 if shared else records.next_version(session, job.participant)
-    quick = not is_refined(settings, job, shared)
     return FilterFit(
         task=task,
         compute=context.compute,
@@ -87,10 +80,11 @@ def fitting(context: WorkerContext, run_id: int, job: Job, reward: bytes, *, sha
         reward=reward,
         seed=seed,
         config=filter_config(settings),
-        progress=lambda stage, share: context.report(run_id, stage, share if quick else _beside(share)),
+        progress=lambda stage, share: context.report(run_id, stage, share),
         references=context.references,
         promise=promise_of(settings),
         study_seed=study_seed,
         version=version,
         outcomes=context.outcomes,
+        stages=stages_of(settings, job),
     )

@@ -20,7 +20,7 @@ from app.domain.studies import Participant, Study
 from app.files.unfinished import REFINEMENT
 from app.installed_tasks.refinements import answers_ahead
 from app.services.answers.misfit import Misfit, doubt_of
-from worker.compute import refining
+from worker.compute import refining, stages
 from worker.compute.filter_fitting import T, TrainPatiently
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, fits, patience, reward_models
@@ -41,8 +41,6 @@ def refine(context: WorkerContext, run_id: int, job: Job, reward: str, draft: st
     """The artefact of the refined filter, or of the same one where none is to be refined; empty: nobody needs it."""
     with context.database.reading() as session:
         settings = session.get_one(Study, job.study_id).settings
-    if not fits.is_refined(settings, job, shared):
-        return draft
     doubt = None if shared else unlearned_doubt(context, job)
     if doubt:
         _clear_away(context, job)
@@ -153,7 +151,8 @@ def _trainer(
     """What trains part by part, and makes room for whoever waits longer."""
 
     def report(share: float) -> None:
-        context.report(run_id, f"refining the filter, {share:.0%} done", fits.refining(share))
+        done = stages.so_far(stages.REFINED, "refinement", stages.TRAINED * share)
+        context.report(run_id, f"refining the filter, {share:.0%} done", done)
 
     def train(part: Callable[[Path], T]) -> T | None:
         parts = patience.train(context, folder, lane, report, is_outdated, is_whole, part)

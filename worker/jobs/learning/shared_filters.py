@@ -5,12 +5,11 @@ import time
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from app.domain.choices import Method
 from app.domain.evaluation import SharedFilter
 from app.domain.models import ModelKind
 from app.domain.studies import Participant, Study
 from app.services.participants import withdrawal
-from worker.compute import baseline_fitting, filter_finishing, shared_reward
+from worker.compute import baseline_fitting, filter_finishing, shared_reward, stages
 from worker.compute.pools import Lane
 from worker.jobs.learning import dataset, filters, fits
 from worker.jobs.runtime import due_lending, records
@@ -22,7 +21,9 @@ def fit(context: WorkerContext, job: Job, run_id: int, step: Step) -> None:
     """Fit the filter that a row asks for; every stage is a step. Nothing is left when it is no longer asked for."""
     started = time.time()
     reward, draft = step("wishes", _wishes, context, job, run_id), ""
-    for stage in filters.STAGES[Method.STUDIO]:
+    with context.database.reading() as session:
+        settings = session.get_one(Study, job.study_id).settings
+    for stage in stages.before_finish(fits.stages_of(settings, job)):
         if not reward or step(f"is-outdated-before-{stage}", _is_outdated, context, job):
             return
         draft = step(stage, filters.fit_stage, context, run_id, job, reward, draft, stage, True)

@@ -24,7 +24,7 @@ from app.settings import Settings
 log = logging.getLogger("worker")
 
 NAME = "pbarl-studio"
-VERSION = "9"
+VERSION = "10"
 """Raised when steps or names of workflows change, so that a half-finished one could not be resumed: it begins anew."""
 
 QUEUES = {

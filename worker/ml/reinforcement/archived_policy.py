@@ -27,6 +27,8 @@ DRIVEN_IN_MODES = 5
 """each is a drive through all of the gate's scenarios"""
 SOUGHT_IN_MODES = 40
 """most of which are refused after a few of these"""
+SHARE_OF_MODES = 0.7
+"""of the time of choose_archived(), at most"""
 NEXT_BEST = 3
 """policies that are left to be tried where the best one does not pass: each is a drive through the check's scenarios"""
 
@@ -49,6 +51,7 @@ def best_archived(
     reference: Sequence[Trajectory],
     collect: Collect,
     beaten: float | None = None,
+    progress: ReportProgress = lambda stage, share: None,
 ) -> list[ArchivedDraft]:
     """The draft with the archived policies that the reward model likes best, the best first; none: its mode is better.
 
@@ -69,7 +72,9 @@ def best_archived(
             most = max(most, trial.preference)
     explored = _in_modes(problem, archived, trials, known, reference)
     drives, whole = DoubtedFirst(problem, reference, collect), 0
-    for _ in range(SOUGHT_IN_MODES if explored else 0):
+    for sought in range(SOUGHT_IN_MODES if explored else 0):
+        share = max(whole / DRIVEN_IN_MODES, sought / SOUGHT_IN_MODES)
+        progress("trying policies that were refined beforehand in modes", SHARE_OF_MODES * share)
         policy, some = max(explored, key=_foreseen)
         if some.foreseen <= most or whole == DRIVEN_IN_MODES:
             break
@@ -126,10 +131,14 @@ def choose_archived(
     started, beaten = time.perf_counter(), gained(problem, own, reference)
     off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
     draft = FilterDraft(off)
-    best = best_archived(problem, draft, archived, known, reference, collect, beaten)
+    best = best_archived(problem, draft, archived, known, reference, collect, beaten, progress)
     if not best:
         return own.timed("archived", started)
-    chosen = gate_refined(problem, draft, best, (), reference, more_reference, collect, progress, beaten)
+
+    def checking(stage: str, share: float) -> None:
+        progress(stage, SHARE_OF_MODES + (1.0 - SHARE_OF_MODES) * share)
+
+    chosen = gate_refined(problem, draft, best, (), reference, more_reference, collect, checking, beaten)
     trials = (*own.trials, *chosen.trials)
     better = replace(chosen, seconds={**own.seconds, **chosen.seconds}) if chosen.weights.refined else own
     return replace(better, trials=trials).timed("archived", started)

@@ -17,7 +17,7 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, or as what was refined beforehand for people who mind one thing, and may have gone elsewhere since."
 )
-_ARCHIVED = (
+BEGUN_AS_ARCHIVED = (
     "The filter is a policy that was refined beforehand for people who mind one thing, maybe in a way of executing it "
     "that is this person's own."
 )
@@ -92,6 +92,7 @@ def gate_refined(
     what passes the gate is tried in, too; ``beaten``: what has to be gained; None: LEAST_LIFT times the mode's gain.
     """
     started, draft, is_doubted = time.perf_counter(), (*drafts, mode)[0], False
+    before = len(draft.trials)
     already_driven, best = {id(each.draft): each.driven for each in archived}, begin_as(mode, archived).draft
     least = max(0.0, LEAST_LIFT * to_beat(problem, draft, reference) if beaten is None else beaten)
     tried_first = (*drafts[:1], *(each.draft for each in archived[:1]))
@@ -102,11 +103,14 @@ def gate_refined(
     later += [(each, gate) for gate, each in product(STRENGTHS[1:], tried_first)]
     later += [(each, gate) for each, gate in product(drafts[1:], STRENGTHS)]
 
+    def done() -> float:
+        return min((len(draft.trials) - before) / (len(at_first) + len(later) + 1), 0.9)
+
     def passing(tries: Sequence[tuple[FilterDraft, float]]) -> list[_Passing]:
         nonlocal draft, is_doubted
         found = []
         for candidate, gate in tries:
-            progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", 0.35)
+            progress(f"checking {gate:.0%} of the refined policy on held-out scenarios", done())
             if id(candidate) in already_driven and gate == STRENGTHS[0]:
                 driven = already_driven[id(candidate)]
                 trial = replace(trial_of(problem, gate, 0.0, reference, driven), refined=True)
@@ -129,12 +133,13 @@ def gate_refined(
         yield from sorted([*found, *passing(later)], key=_gain, reverse=True)
 
     for each in best_first():
+        progress("checking a refined policy on many more scenarios", done())
         checked, _ = try_refined(problem, each.draft, each.gate, more_reference(), collect)
         draft = replace(draft, trials=(*draft.trials, checked))
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
             weights = each.draft.weights.changed(gate=each.gate)
             tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
-            note = _REFINED if any(each.draft is learned for learned in drafts) else _ARCHIVED
+            note = _REFINED if any(each.draft is learned for learned in drafts) else BEGUN_AS_ARCHIVED
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, note))
             return draft.timed("gate_refined", started)
     whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}

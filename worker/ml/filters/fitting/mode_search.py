@@ -14,7 +14,7 @@ from worker.ml.filters.exported.shield import limits_of, untried
 from worker.ml.filters.fitting.filter_draft import FilterDraft, GateTrial
 from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
 from worker.ml.filters.fitting.further_surface import FurtherSurface
-from worker.ml.filters.fitting.gate import acceptable, largest_forces, signal_changes, successes, try_on
+from worker.ml.filters.fitting.gate import acceptable, largest_forces, signal_changes, spread_of, successes, try_on
 from worker.ml.filters.fitting.mode_archive import tail_growth_n
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import CAUTION, ResponseSurface, best_mode
@@ -23,6 +23,10 @@ from worker.ml.rewards.reward_models import StructuredReward
 
 CORRECTED_ATTEMPTS = 2
 """with the surface that an archive corrects, the second more careful about success"""
+
+_UNCLEAR = "The labels do not yet say clearly what to change; the mode is off."
+_UNKEPT = "No mode was better while keeping the task and the forces; the mode is off."
+_NO_BETTER = "Of no mode more was foreseen; it is off."
 
 
 def find_mode(
@@ -48,16 +52,33 @@ def find_mode(
     search = _ModeSearch(problem, surface, pool, reference, collect, progress)
     search.by_surface()
     if not search.tried:
-        note = "The labels do not yet say clearly what to change; the mode is off."
-        return search.without_mode(note).timed("mode", started)
+        return search.without_mode(_UNCLEAR).timed("mode", started)
     sought = search.tried[-1].mode
     search.by_archive()
-    if not search.accepted:
-        search.weakened(sought)
-    if not search.accepted:
-        note = "No mode was better while keeping the task and the forces; the mode is off."
-        return search.without_mode(note).timed("mode", started)
-    return search.with_best_mode().timed("mode", started)
+    return search.best_or_weakened(sought).timed("mode", started)
+
+
+def find_mode_quickly(
+    problem: FilterProblem,
+    surface: ResponseSurface,
+    pool: Pool,
+    reference: Sequence[Trajectory],
+    collect: Collect,
+    least: float,
+    progress: ReportProgress = lambda stage, share: None,
+) -> FilterDraft:
+    """The first mode that is acceptable; none is tried where no more than ``least`` is foreseen of the best.
+
+    ``least``: of the change of the learned return, as in GateTrial. See find_mode() for the rest.
+    """
+    started = time.perf_counter()
+    search = _ModeSearch(problem, surface, pool, reference, collect, progress)
+    if search.foreseen <= least:
+        return search.without_mode(_NO_BETTER).timed("mode", started)
+    search.corrected()
+    if not search.tried:
+        return search.without_mode(_UNCLEAR).timed("mode", started)
+    return search.best_or_weakened(search.tried[-1].mode).timed("mode", started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +109,10 @@ class _ModeSearch:
         self.wishes = problem.reward.signal_weights(pool.rollouts)
         self.further = _further(problem, self.wishes, pool)
         self.off = FilterWeights(shield=untried(problem.task.observation, problem.policy.action_size, reference))
+        config = problem.config
+        by_surface = config.mode_attempts_beyond_sums if self.further else config.mode_attempts
+        self.attempts = by_surface + 1 + CORRECTED_ATTEMPTS
+        """at most, before the last is weakened"""
         self.tried: list[_Tried] = []
         self.accepted: list[_Tried] = []
 
@@ -96,14 +121,13 @@ class _ModeSearch:
         config = self.problem.config
         attempts = config.mode_attempts_beyond_sums if self.further else config.mode_attempts
         enough = attempts if self.further else config.modes_to_choose_from
-        for attempt in range(attempts):
+        for _ in range(attempts):
             if len(self.accepted) == enough:
                 return
-            self.progress("searching the person's way of doing the task", 0.3 * attempt / attempts)
+            self._say("searching the person's way of doing the task")
             mode = self._best_by(self.surface, rejected=len(self.tried) - len(self.accepted))
             if not self._is_new(mode):
                 return
-            self.progress(f"checking mode {attempt + 1} on held-out scenarios", 0.03 + 0.3 * attempt / attempts)
             driven = self._try(mode).driven
             changes = signal_changes(self.reference, driven)
             self.surface = self.surface.with_observed(mode, changes, successes(driven))
@@ -113,24 +137,41 @@ class _ModeSearch:
         """Try the best of the archive, and what is best by the surface that it corrects."""
         if not self.archive:
             return
-        self.progress("checking what an archive of modes says on held-out scenarios", 0.31)
         best = self.archive.best(self.wishes, self.problem.config.pressed_n)
-        corrected = replace(self.surface, archive=self.archive)
         if best is not None and self._is_new(best):
             self._try(best)
+        self.corrected()
+
+    @property
+    def foreseen(self) -> float:
+        """What the best mode changes of the learned return, as in GateTrial; infinite where signals do not say it."""
+        if self.further:
+            return np.inf
+        surface = replace(self.surface, archive=self.archive)
+        changes, _ = surface.predict(self._best_by(surface, 0))
+        return float(changes @ self.wishes.mean(axis=0)) / spread_of(self.problem.reward.member_returns(self.reference))
+
+    def corrected(self) -> None:
+        """Try what is best by the surface that the archive corrects, where there is one."""
+        surface = replace(self.surface, archive=self.archive)
         for rejected in range(CORRECTED_ATTEMPTS):
-            mode = self._best_by(corrected, rejected)
+            mode = self._best_by(surface, rejected)
             if self._is_new(mode) and self._try(mode) in self.accepted:
                 return
 
-    def weakened(self, mode: FloatArray) -> None:
+    def best_or_weakened(self, sought: FloatArray) -> FilterDraft:
+        """The best acceptable mode; where none was, as much of ``sought`` as is; at worst none."""
+        if not self.accepted:
+            self._weakened(sought)
+        return self._with_best_mode() if self.accepted else self.without_mode(_UNKEPT)
+
+    def _weakened(self, mode: FloatArray) -> None:
         """Try less and less of a mode that was not acceptable."""
         for gate in self.problem.config.gates:
-            self.progress(f"checking the mode at {gate:.0%} on held-out scenarios", 0.32)
             if self._try(mode, gate) in self.accepted:
                 return
 
-    def with_best_mode(self) -> FilterDraft:
+    def _with_best_mode(self) -> FilterDraft:
         """The mode that is best by the learned return among those that were acceptable."""
         best = max(self.accepted, key=lambda each: each.trial.preference)
         trials = (*(each.trial for each in self.tried if each is not best), best.trial)
@@ -156,10 +197,15 @@ class _ModeSearch:
             further=self.further.coefficients if self.further else None,
         )
 
+    def _say(self, stage: str) -> None:
+        self.progress(stage, min(len(self.tried) / self.attempts, 0.9))
+
     def _is_new(self, mode: FloatArray) -> bool:
         return bool(mode.any()) and not any(np.array_equal(mode, each.mode) for each in self.tried)
 
     def _try(self, mode: FloatArray, gate: float = 1.0) -> _Tried:
+        some = "the mode" if gate < 1.0 else f"mode {len(self.tried) + 1}"
+        self._say(f"checking {some} at {gate:.0%} on held-out scenarios")
         modes = self.problem.task.modes
         weights = self.off.changed(mode=modes.named(mode), gate=gate)
         act = act_of(modes, self.problem.policy, weights)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.fitting.filter_draft import FilterDraft
-from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem, ReportProgress
+from worker.ml.filters.fitting.filter_problem import Collect, FilterProblem
 from worker.ml.filters.fitting.mode_search import find_mode
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.residual import train_residual
@@ -23,7 +23,6 @@ def fit_studio(
     reference: Sequence[Trajectory],
     more_reference: Callable[[], Sequence[Trajectory]],
     collect: Collect,
-    progress: ReportProgress = lambda stage, share: None,
     refined: Callable[[FilterDraft], FilterDraft] = lambda mode: mode,
 ) -> FilterDraft:
     """All stages in a row, without shield.
@@ -31,6 +30,6 @@ def fit_studio(
     ``reference``, ``more_reference``: of the reference policy on the problem's gate and home scenarios; ``refined``:
     gives the draft a refined policy, if that is better than the mode; no residual is needed then.
     """
-    draft = refined(find_mode(problem, surface, pool, reference, collect, progress))
-    draft = train_residual(problem, draft, collect, progress)
-    return gate_residual(problem, draft, reference, more_reference, collect, progress)
+    draft = refined(find_mode(problem, surface, pool, reference, collect))
+    draft = train_residual(problem, draft, collect)
+    return gate_residual(problem, draft, reference, more_reference, collect)

@@ -42,7 +42,7 @@ def train_residual(
     kept = draft
     earned: FloatArray | None = None
     for number in range(problem.config.residual_rounds):
-        share = 0.35 + 0.35 * number / problem.config.residual_rounds
+        share = number / problem.config.residual_rounds
         progress(f"rolling out the filter, round {number + 1}", share)
         started = time.perf_counter()
         rounds.append(collect(*residual_rollouts(problem, draft, number)))
@@ -53,7 +53,7 @@ def train_residual(
         else:
             draft = replace(draft, weights=kept.weights)
             problem = replace(problem, config=problem.config.bolder(0.5))
-        progress(f"training the action encoder, round {number + 1}", share + 0.1)
+        progress(f"training the action encoder, round {number + 1}", share + 0.5 / problem.config.residual_rounds)
         draft = (learn or learn_round)(problem, draft, rounds)
     return draft
 

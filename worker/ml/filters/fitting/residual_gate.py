@@ -22,6 +22,8 @@ from worker.ml.filters.fitting.gate import (
 
 LESS = 2 / 3
 """of a share that loses too much in other scenarios is what is tried there next, or less"""
+USUAL_TRIALS = 6
+"""of shares, the most for most people"""
 LOOK = 40
 """of the other scenarios, after which it is asked whether it is clear yet that a share keeps the task"""
 CLEAR = 2.0
@@ -128,7 +130,8 @@ class _ResidualGate:
         return _Tried(share, self._noted(share, self.reference, driven), driven)
 
     def _driven(self, share: float, beside: Sequence[Trajectory]) -> Sequence[Trajectory]:
-        self.progress(f"checking {share:.0%} of the residual on held-out scenarios", 0.75 + 0.01 * len(self.trials))
+        done = min(len(self.trials) / USUAL_TRIALS, 0.9)
+        self.progress(f"checking {share:.0%} of the residual on held-out scenarios", done)
         weights = self.draft.weights.changed(residual_share=share)
         act = act_of(self.problem.task.modes, self.problem.policy, weights)
         return self.collect(act, [each.scenario for each in beside], 0.0, self.problem.seed)
