@@ -132,7 +132,7 @@ def _run(
         "task": task,
         "user": user,
         "filter": which,
-        "tried": sum(trial.residual_share == 0.0 for trial in draft.trials),
+        "tried": sum(not trial.refined and trial.residual_share == 0.0 for trial in draft.trials),
         **seconds,
         "seconds": round(time.perf_counter() - begun, 1),
         "archived_policy": bool(draft.weights.refined),
