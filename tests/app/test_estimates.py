@@ -113,6 +113,19 @@ def test_what_was_never_done_here_is_said_to_be_unknown(look: Look) -> None:
     assert "to go" not in page
 
 
+def test_what_a_filter_on_the_way_took_says_nothing_of_the_last_which_is_sought_longer(
+    database: Database, study: Study, look: Look
+) -> None:
+    with database.writing() as session:
+        earlier, _ = factories.make_participant(session, study)
+        took(session, earlier, study, RunKind.REWARD, 4)
+        took(session, earlier, study, RunKind.FILTER, 20, labels=LABELS // 2)
+        took(session, earlier, study, RunKind.METHOD, 10, "prefft")
+        took(session, earlier, study, RunKind.FILMS, 30, "trials")
+        took(session, earlier, study, RunKind.FILMS, 20, "before-after")
+    assert "to go" not in look()
+
+
 def test_the_first_robot_is_foretold_from_what_it_took_before(database: Database, study: Study, look: Look) -> None:
     somebody_before(database, study)
     assert "About 2 minutes to go" in look(), "PrefFT beside the filter, then two of six films: 100 + 10 s"
@@ -186,7 +199,7 @@ def test_a_last_filter_takes_as_long_as_other_last_filters_whatever_milestones_t
         earlier, _ = factories.make_participant(session, study)
         for labels in (2, 4, 6):
             took(session, earlier, study, RunKind.FILTER, 30, labels=labels)
-        assert estimates.usual_s(session, study, RunKind.FILTER) == pytest.approx(30), "nothing nearer is known yet"
+        assert estimates.usual_s(session, study, RunKind.FILTER) is None, "those are found in a minute, it is not"
         took(session, earlier, study, RunKind.FILTER, 90)
         assert estimates.usual_s(session, study, RunKind.FILTER) == pytest.approx(90)
 

@@ -33,5 +33,12 @@ def before_finish(stages: Stages) -> tuple[str, ...]:
 
 
 def during(stages: Stages, name: str, progress: ReportProgress) -> ReportProgress:
-    """What a stage says its own progress to, for ``progress`` to hear that of the whole."""
-    return lambda stage, share: progress(stage, so_far(stages, name, share))
+    """What a stage says its own progress to, for ``progress`` to hear that of the whole, which never falls."""
+    furthest = 0.0
+
+    def hear(stage: str, share: float) -> None:
+        nonlocal furthest
+        furthest = max(furthest, share)
+        progress(stage, so_far(stages, name, furthest))
+
+    return hear

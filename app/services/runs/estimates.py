@@ -31,7 +31,7 @@ def usual_s(session: Session, study: Study, kind: RunKind, what: str = "") -> fl
     """Median seconds of the newest runs of the same work: same task, same settings that matter, first attempts.
 
     ``what``: the method that is trained, or what the films are for. Trainings that left no model were given up. Those
-    for all of somebody's labels count where there are any: only they are refined, and looked at for harm to the end.
+    for all of somebody's labels count where there are any, and filters for fewer never do: these are found in a minute.
     """
     runs = (
         select(Run, Study)
@@ -44,7 +44,8 @@ def usual_s(session: Session, study: Study, kind: RunKind, what: str = "") -> fl
     alike = {of.id: _what_matters(kind, of.settings) for of in {of for _, of in rows} | {study}}
     same = [(run, of) for run, of in rows if _what(run) == what and alike[of.id] == alike[study.id]]
     last = [(run, of) for run, of in same if _labels(run) == of.settings.labels_per_participant]
-    seconds = [(run.finished_at - run.started_at).total_seconds() for run, _ in last or same if run.finished_at]
+    alike_ones = last if kind is RunKind.FILTER else last or same
+    seconds = [(run.finished_at - run.started_at).total_seconds() for run, _ in alike_ones if run.finished_at]
     return median(seconds[:RECENT]) if seconds else None
 
 

@@ -134,6 +134,12 @@ def test_the_whole_fit_moves_the_robot_where_the_person_wants_it(
     assert pickle.loads(pickle.dumps(draft)).weights.mode == draft.weights.mode  # noqa: S301
 
 
+def _heard(stage: Callable[[ReportProgress], FilterDraft]) -> tuple[FilterDraft, list[float]]:
+    """What it made, and the shares that it said were done."""
+    shares = list[float]()
+    return stage(lambda _, share: shares.append(share)), shares
+
+
 def test_every_stage_says_how_far_it_is(reference: list[Trajectory], surface: ResponseSurface) -> None:
     torch.set_num_threads(1)
     asked, collect, draft = problem(1.0, reference, residual_rounds=3), World().collect, FilterDraft(FilterWeights())
@@ -143,8 +149,7 @@ def test_every_stage_says_how_far_it_is(reference: list[Trajectory], surface: Re
         lambda say: residual_gate.gate_residual(asked, draft, reference, no_more, collect, say),
     )
     for stage in stages:
-        shares = list[float]()
-        draft = stage(lambda _, share, shares=shares: shares.append(share))  # type: ignore[misc]
+        draft, shares = _heard(stage)
         assert len(set(shares)) > 1
         assert shares == sorted(shares)
         assert shares[0] == 0.0

@@ -28,7 +28,7 @@ DRIVEN_IN_MODES = 5
 SOUGHT_IN_MODES = 40
 """most of which are refused after a few of these"""
 SHARE_OF_MODES = 0.7
-"""of the time of choose_archived(), at most"""
+"""of the time of choose_archived(); a guess, by which it says how far it is and nothing else"""
 NEXT_BEST = 3
 """policies that are left to be tried where the best one does not pass: each is a drive through the check's scenarios"""
 

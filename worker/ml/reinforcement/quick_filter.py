@@ -19,7 +19,7 @@ from worker.ml.filters.fitting.mode_search import find_mode_quickly
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy
-from worker.ml.reinforcement.refinement_gate import BEGUN_AS_ARCHIVED, SURE
+from worker.ml.reinforcement.refinement_gate import ARCHIVED_NOTE, SURE
 
 _ON_THE_WAY = "This filter was found quickly, on the way; the one that follows all answers is sought longer."
 
@@ -47,7 +47,7 @@ def quick_filter(
         shield = untried(problem.task.observation, problem.policy.action_size, reference)
         weights = FilterWeights(refined=policy.policy.weights, shield=shield)
         tested = limits_of(problem.task.observation, problem.task.action, policy.driven, reference)
-        own = FilterDraft(weights, trials=(*own.trials, trial), notes=(BEGUN_AS_ARCHIVED,), tested=tested)
+        own = FilterDraft(weights, trials=(*own.trials, trial), notes=(ARCHIVED_NOTE,), tested=tested)
     return replace(own, notes=(*own.notes, _ON_THE_WAY)).timed("quick", started)
 
 

@@ -17,7 +17,7 @@ _REFINED = (
     "The filter was refined by reinforcement learning on the learned preference. It began as the execution mode that "
     "is shown, or as what was refined beforehand for people who mind one thing, and may have gone elsewhere since."
 )
-BEGUN_AS_ARCHIVED = (
+ARCHIVED_NOTE = (
     "The filter is a policy that was refined beforehand for people who mind one thing, maybe in a way of executing it "
     "that is this person's own."
 )
@@ -139,7 +139,7 @@ def gate_refined(
         if keeps_task(problem, checked, more_reference()) and checked.success_change >= -LARGEST_LOSS:
             weights = each.draft.weights.changed(gate=each.gate)
             tested = limits_of(problem.task.observation, problem.task.action, each.driven, reference)
-            note = _REFINED if any(each.draft is learned for learned in drafts) else BEGUN_AS_ARCHIVED
+            note = _REFINED if any(each.draft is learned for learned in drafts) else ARCHIVED_NOTE
             draft = replace(draft, weights=weights, tested=tested, notes=(*draft.notes, note))
             return draft.timed("gate_refined", started)
     whys = {is_doubted: _DOUBTED, not at_first: _GIVEN_UP}

@@ -23,7 +23,7 @@ from worker.ml.filters.fitting.gate import (
 LESS = 2 / 3
 """of a share that loses too much in other scenarios is what is tried there next, or less"""
 USUAL_TRIALS = 6
-"""of shares, the most for most people"""
+"""of shares; a guess, by which the gate says how far it is and nothing else"""
 LOOK = 40
 """of the other scenarios, after which it is asked whether it is clear yet that a share keeps the task"""
 CLEAR = 2.0
