@@ -15,7 +15,7 @@ from scipy import stats
 
 from worker.analysis.comparison import comparison_page, comparison_rows, result_pages
 from worker.analysis.comparison.comparison_rows import EvaluatedCell, pooled, table_rows
-from worker.analysis.comparison.pareto import pareto_svg
+from worker.analysis.comparison.pareto import pareto_svg, pictures
 from worker.analysis.comparison.published import TABLE_1, published
 from worker.analysis.comparison.table_files import tables, to_csv
 from worker.analysis.filters.evaluation import success_change
@@ -293,6 +293,17 @@ def test_the_panels_of_many_users_can_be_told_apart(users: int) -> None:
         assert wide > 0.2 * width, "on a page that is as wide as the picture"
     for (x, y, wide, high), (other_x, other_y, _, _) in combinations(boxes, 2):
         assert abs(x - other_x) > wide or abs(y - other_y) > high
+
+
+def test_a_picture_shows_methods_to_choose_between_and_none_that_fails_the_task() -> None:
+    rows = table_rows(pooled(RUNS))
+    [(name, without)] = pictures(rows, list(METHODS))
+    assert name == "pareto-feeding.svg"
+    keeping = [{**row, "success_delta": -0.1} if row["method"] == "prefft" else row for row in rows]
+    [(_, drawn)] = pictures(keeping, list(METHODS))
+    assert "<title>prefft</title>" in drawn
+    assert "<title>prefft</title>" not in without
+    assert not list(pictures([row for row in rows if row["method"] != "prefft"], list(METHODS)))
 
 
 def test_a_method_keeps_its_colour_in_a_picture_without_the_others() -> None:

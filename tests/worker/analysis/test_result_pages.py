@@ -1,6 +1,7 @@
 """The tables of published result pages say what the files beside them say."""
 
 import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ def rows(name: str) -> list[dict[str, str]]:
 def test_a_comparison(page: Path) -> None:
     """python -m tests.benchmarks.comparison_report writes it anew."""
     assert page.read_text() == comparison_page.page(page.parent)
+    pictures = {each.name for each in page.parent.glob("pareto-*.svg")}
+    assert pictures == set(re.findall(r"\]\((pareto-[^)]+)\)", page.read_text())), "each is shown, none is missing"
 
 
 def test_feedback_efficiency() -> None:

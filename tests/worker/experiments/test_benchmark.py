@@ -68,7 +68,7 @@ def test_the_tables_are_written_from_whatever_is_finished(work: Path, tmp_path: 
     assert f"as a hash: {benchmark_cell.code_mark()} (4 runs)." in page
     assert "    the command\n" in page
     assert not (tmp_path / "paired.csv").exists(), "no baseline was run"
-    assert (tmp_path / "pareto-feeding.svg").read_text().startswith("<svg")
+    assert not (tmp_path / "pareto-feeding.svg").exists(), "there is one method to choose"
     assert len(rows(tmp_path / "costs.csv")) == 4
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from worker.analysis.comparison import result_pages
+from worker.analysis.comparison import pareto, result_pages
 from worker.analysis.comparison.comparison_rows import REFERENCE, Row, compared
 from worker.analysis.comparison.published import published
 from worker.analysis.comparison.table_files import DESCRIPTIONS, Tables, default_in, read
@@ -195,10 +195,28 @@ def _seeds(tables: Tables) -> str:
 def _methods(tables: Tables) -> str:
     shown = compared(tables["table1"])
     parts = ["## Every method\n" + READING]
+    pictures = pareto.names(tables["table1"])
     for task in dict.fromkeys(row["task"] for row in shown):
-        head = [f"### {task}", "| user | method | seeds | success | paper | R-hat | paper | r^H |", "|---" * 8 + "|"]
-        parts.append("\n".join([*head, *(_line(row) for row in shown if row["task"] == task)]))
+        head = ["| user | method | seeds | success | paper | R-hat | paper | r^H |", "|---" * 8 + "|"]
+        parts.append(
+            "\n".join(
+                [f"### {task}", *_picture(task, pictures), *head, *(_line(row) for row in shown if row["task"] == task)]
+            )
+        )
     return "\n\n".join(parts)
+
+
+def _picture(task: str, pictures: Mapping[str, str]) -> list[str]:
+    if task not in pictures:
+        return []
+    return [
+        f"![{task}: success and change of r^H of every method, a panel per user; the numbers are in the table"
+        f" below]({pictures[task]})",
+        "",
+        f"*Up and to the right is better; bars are 95 % intervals. What loses more than {100 * pareto.LARGEST_LOSS:.0f}"
+        " points of success is in the table alone.*",
+        "",
+    ]
 
 
 def _line(row: Row) -> str:

@@ -14,8 +14,10 @@ LEGEND_WIDTH, LEGEND_LINE = 112.0, 18.0
 # Okabe and Ito's colours, which people with any colour vision can tell apart.
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#8a6d00", "#666666")
 TICKS = 5
-CLOSE_POINTS = 0.2
-"""The second picture leaves out methods that lose more success than this."""
+LARGEST_LOSS = 0.2
+"""of success; marks of methods that lose more would leave no room for the others"""
+FEWEST_METHODS = 3
+"""the reference policy and two between which somebody can choose"""
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,19 @@ class _Look:
         )
 
 
+def names(rows: Sequence[Row]) -> dict[str, str]:
+    """Pictures' files by task, of the tasks in which there are methods to choose between. ``rows``: of table_rows()."""
+    methods: dict[str, set[str]] = {}
+    for row in rows:
+        methods.setdefault(row["task"], set()).add(row["method"])
+    return {task: f"pareto-{task}.svg" for task, found in methods.items() if len(found) >= FEWEST_METHODS}
+
+
 def pictures(rows: Sequence[Row], known: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Two for every task, by the names of their files. ``rows``: of table_rows(); ``known``: see pareto_svg()."""
-    for task in dict.fromkeys(row["task"] for row in rows):
+    """The pictures, by the names of their files. ``rows``: of table_rows(); ``known``: see pareto_svg()."""
+    for task, name in names(rows).items():
         shown = compared([row for row in rows if row["task"] == task])
-        close = [row for row in shown if row["success_delta"] >= -CLOSE_POINTS]
-        yield f"pareto-{task}.svg", pareto_svg(task, shown, known)
-        yield f"pareto-{task}-close.svg", pareto_svg(task, close, known)
+        yield name, pareto_svg(task, [row for row in shown if row["success_delta"] >= -LARGEST_LOSS], known)
 
 
 def pareto_svg(task: str, rows: Sequence[Row], known: Sequence[str]) -> str:
