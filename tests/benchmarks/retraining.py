@@ -5,17 +5,18 @@
 Per task: 200 answers of a scripted user, then what the worker does after an early milestone and after the last:
 reward model, all stages of the filter, promise about harm, 100 unseen scenarios, ONNX export, bundle. Beforehand what
 the worker does while people answer: it makes rollouts that are the same for everybody, in one process behind everything
-else. Run it alone on the machine: these are plain seconds.
+else. Run it alone on the machine: these are plain seconds. A user's rows are written once measured, in place of older
+ones; those of other users and tasks stay, so that it can be run task by task.
 """
 
 import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from tqdm import tqdm
@@ -40,6 +41,7 @@ from worker.ml.teachers import TASTES
 
 STAGES = ("reward", "quick", "mode", "residual", "gate", "archived", "promise", "evaluation_and_bundle")
 FILTERS = {"quick": stages.QUICK, "last": stages.LAST}
+Row: TypeAlias = dict[str, Any]
 PROVENANCE = Provenance("benchmark", "P01", 1, 200, "", 0, "2000-01-01T00:00:00+00:00", "", "none")
 
 
@@ -49,20 +51,29 @@ TITLE = "# From the last label to the bundle, in seconds"
 def main() -> None:
     """Measure every task and user that was asked for."""
     options = _options()
-    rows: list[dict[str, Any]] = []
+    table = options.output.with_suffix(".csv")
+    rows: list[Row] = list(result_tables.read(table))
     for task in tqdm(options.tasks, unit="task"):
-        for user in options.users:
-            rows += _measured(task, user, options)
+        for measured in _measured(task, options):
+            rows = _with(measured, rows)
+            result_tables.write(table, rows)
     sys.stdout.write(_markdown(rows))
-    if options.output:
-        page = options.output.with_suffix(".md")
-        page.write_text(result_pages.page(page, TITLE, _tables(rows, options)))
-        result_tables.write(options.output.with_suffix(".csv"), rows)
+    page = options.output.with_suffix(".md")
+    page.write_text(result_pages.page(page, TITLE, _tables(rows, options)))
 
 
-def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[str, Any]]:
+def _with(measured: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
+    """A user's new rows among those of others; a table of other columns is begun anew."""
+    new = measured[0]
+    kept = [
+        row for row in rows if row.keys() == new.keys() and (row["task"], row["user"]) != (new["task"], new["user"])
+    ]
+    return sorted([*kept, *measured], key=lambda row: catalogue.names().index(row["task"]))
+
+
+def _measured(task: str, options: argparse.Namespace) -> Iterator[list[Row]]:
+    """User by user, with one worker that has made everything ready."""
     cached = RolloutCache(task, options.work_directory / "rollouts")
-    bench = BenchmarkUser(Cell(task, TASTES[user], "pbarl", 0), BenchmarkConfig(), cached, options.work_directory)
     compute = Compute(options.processes)
     references: dict[tuple[str, range], list[Trajectory]] = {}
     outcomes: dict[tuple[str, int], list[Outcome]] = {}
@@ -72,12 +83,15 @@ def _measured(task: str, user: str, options: argparse.Namespace) -> list[dict[st
             compute.warm_up(lane, partial(learning.warm_up, task))
         make_ready(compute, references, outcomes, task, PAPER_PROTOCOL, 0)
         ahead = round(time.perf_counter() - started, 1)
-        runs = [
-            {**_run(task, user, bench, compute, references, outcomes, each), "made_ready": ahead} for each in FILTERS
-        ]
+        for user in options.users:
+            cell = Cell(task, TASTES[user], "pbarl", 0)
+            bench = BenchmarkUser(cell, BenchmarkConfig(), cached, options.work_directory)
+            yield [
+                {**_run(task, user, bench, compute, references, outcomes, each), "made_ready": ahead}
+                for each in FILTERS
+            ]
     finally:
         compute.close()
-    return runs
 
 
 def _run(
@@ -88,7 +102,7 @@ def _run(
     references: dict[tuple[str, range], list[Trajectory]],
     outcomes: dict[tuple[str, int], list[Outcome]],
     which: str,
-) -> dict[str, Any]:
+) -> Row:
     seconds, begun = dict.fromkeys(STAGES, 0.0), time.perf_counter()
 
     def measured(stage: str, started: float) -> None:
@@ -149,18 +163,18 @@ def _no_beat() -> None:
     """Nobody watches."""
 
 
-def _markdown(rows: list[dict[str, Any]]) -> str:
+def _markdown(rows: Sequence[Row]) -> str:
     names = list(rows[0])
     lines = ["| " + " | ".join(name.replace("_", " ") for name in names) + " |", "|---" * len(names) + "|"]
     lines += ["| " + " | ".join(str(row[name]) for name in names) + " |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
-def _tables(rows: list[dict[str, Any]], options: argparse.Namespace) -> str:
+def _tables(rows: Sequence[Row], options: argparse.Namespace) -> str:
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
     return f"""\
-200 scripted answers; {options.processes} processes of one thread on {os.cpu_count()} cores; load averages at the end
-{load}.
+200 scripted answers; {options.processes} processes of one thread on {os.cpu_count()} cores; load averages when the last
+rows were written {load}.
 
 {_markdown(rows)}"""
 
@@ -173,7 +187,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--work-directory", type=Path, default=Path("data/benchmark"), help="of the benchmark's rollouts"
     )
-    parser.add_argument("--output", type=result_tables.stem, help="path without ending of the page and the table")
+    parser.add_argument(
+        "--output", type=result_tables.stem, required=True, help="path without ending of the page and the table"
+    )
     return parser.parse_args()
 
 
