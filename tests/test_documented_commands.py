@@ -94,6 +94,9 @@ RUN: dict[str, str | Elsewhere | OnlyParsed] = {
     "worker explore": OnlyParsed(SHIPPED + "tests/worker/experiments/test_fit_response_surface.py"),
     "worker archive": OnlyParsed(SHIPPED + "tests/worker/experiments/test_archive_modes.py"),
     "worker archive-policies": OnlyParsed(SHIPPED + "tests/worker/experiments/test_archive_policies.py"),
+    "worker archive-policies-in-modes": OnlyParsed(
+        SHIPPED + "tests/worker/experiments/test_archive_policies_in_modes.py"
+    ),
     "worker foresee": OnlyParsed(SHIPPED + "tests/worker/ml/test_signal_predictor.py"),
     "worker import-clips": Elsewhere(
         "tests/worker/jobs/test_own_clips.py::test_the_documented_example_becomes_a_study"

@@ -14,6 +14,7 @@ MODULES = {
     "explore": "training",
     "archive": "training",
     "archive-policies": "training",
+    "archive-policies-in-modes": "training",
     "foresee": "training",
     "start-posture": "new_task",
     "speed-weight": "new_task",

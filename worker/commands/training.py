@@ -11,6 +11,7 @@ from worker.commands.arguments import add_processes, add_task
 from worker.experiments import (
     archive_modes,
     archive_policies,
+    archive_policies_in_modes,
     fit_response_surface,
     pretrain_policy,
     train_signal_predictor,
@@ -21,7 +22,7 @@ from worker.tasks.registry import NotExplored, checkpoint
 
 
 def add(commands: Commands) -> None:
-    """Add ``pretrain``, ``explore``, ``archive``, ``archive-policies`` and ``foresee``."""
+    """Add what is trained and driven once for everybody, from ``pretrain`` to ``foresee``."""
     pretrain = add_command(commands, "pretrain", _pretrain)
     add_task(pretrain)
     pretrain.add_argument("--seed", type=int, default=0)
@@ -43,6 +44,12 @@ def add(commands: Commands) -> None:
     add_task(policies)
     policies.add_argument(
         "--work-directory", type=Path, help="finished policies; default: archive-policies/ in the data directory"
+    )
+
+    in_modes = add_command(commands, "archive-policies-in-modes", _archive_policies_in_modes)
+    add_task(in_modes)
+    in_modes.add_argument(
+        "--work-directory", type=Path, help="what was driven; default: archive-policies-in-modes/ in the data directory"
     )
 
     foresee = add_command(commands, "foresee", _foresee)
@@ -89,6 +96,18 @@ def _archive_policies(said: argparse.Namespace) -> int:
     try:
         record = archive_policies.archive_policies(said.task, work)
     except (archive_policies.NothingToRefine, NotExplored) as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
+    sys.stdout.write(json.dumps(record, indent=2) + "\n")
+    return 0
+
+
+def _archive_policies_in_modes(said: argparse.Namespace) -> int:
+    """Try archived policies in modes that people would want, half an hour to an hour; what was driven is kept."""
+    work = said.work_directory or Settings().data_dir / "archive-policies-in-modes" / said.task
+    try:
+        record = archive_policies_in_modes.archive_policies_in_modes(said.task, work)
+    except (archive_policies_in_modes.NoPolicies, NotExplored) as error:
         sys.stderr.write(f"Error: {error}\n")
         return 1
     sys.stdout.write(json.dumps(record, indent=2) + "\n")

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from worker.analysis.filters.promise import Outcome, Promise
 from worker.compute import harm_tests, learning, refining, simulation, stages
+from worker.compute.archived import everything_archived
 from worker.compute.pools import Computing, Lane
 from worker.compute.simulation import surface_file
 from worker.compute.stages import Stages
@@ -183,11 +184,11 @@ class FilterFit:
     def _archived(self, progress: ReportProgress) -> list[ArchivedPolicy]:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
         progress("looking at policies that were refined beforehand", 0.0)
-        scenarios, archived = self.problem.config.gate_block(self.problem.task), []
-        for name, policy in simulation.archived_policies(self.task).items():
-            driven = self._driven(driven_as(self.task, name), policy, scenarios)
-            archived.append(ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name)))
-        return archived
+        scenarios, found = self.problem.config.gate_block(self.problem.task), list[ArchivedPolicy]()
+        for each in everything_archived(self.task):
+            driven = self._driven(driven_as(self.task, each.name), each.exported, scenarios)
+            found.append(ArchivedPolicy(each.policy, driven, each.around, each.mode))
+        return found
 
     def _surface(self) -> ResponseSurface:
         return ResponseSurface.load(surface_file(self.task), self.problem.task.modes, self.problem.task.signals)
@@ -270,9 +271,10 @@ class FilterFit:
     def reference(self, scenarios: range, policy: str = "") -> Sequence[Trajectory]:
         """The frozen policy's rollouts, or those of another one: the same for everybody, so they are made once per
         worker."""
-        return self._driven(f"{self.task} {policy}".strip(), simulation.reference_policy(self.task, policy), scenarios)
+        act = simulation.reference_policy(self.task, policy).mean
+        return self._driven(f"{self.task} {policy}".strip(), lambda: act, scenarios)
 
-    def _driven(self, name: str, policy: ReferencePolicy, scenarios: range) -> Sequence[Trajectory]:
+    def _driven(self, name: str, act: Callable[[], Act], scenarios: range) -> Sequence[Trajectory]:
         if (name, scenarios) not in self.references:
-            self.references[name, scenarios] = self.collect(policy.mean, scenarios, 0.0, 0)
+            self.references[name, scenarios] = self.collect(act(), scenarios, 0.0, 0)
         return self.references[name, scenarios]

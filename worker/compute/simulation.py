@@ -117,6 +117,11 @@ def archived_policies(name: str) -> Mapping[str, GaussianPolicy]:
     return {file.stem: GaussianPolicy.load(file) for file in whole_files(archive_folder(name), "*.safetensors")}
 
 
+def archived_modes_file(name: str) -> Path:
+    """Where the modes are kept in which they were tried for everybody."""
+    return archive_folder(name) / "in_modes.json"
+
+
 def surface_around_file(name: str, policy: str) -> Path:
     """Where the response surface of modes around one of them is kept."""
     return archive_folder(name) / "around" / f"{policy}.safetensors"

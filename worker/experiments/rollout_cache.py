@@ -1,16 +1,16 @@
 """Rollouts that many fits need, kept on disk: one file per rollout, complete or absent, made by whoever comes first."""
 
 import hashlib
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from pathlib import Path
 
 from worker.compute import simulation
+from worker.compute.archived import Archived, everything_archived
 from worker.compute.behaviours import Behaviour
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.filters.fitting.pool import Pool
-from worker.ml.policies.gaussian import GaussianPolicy
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy
 from worker.tasks import registry
@@ -42,29 +42,29 @@ class RolloutCache:
         return Pool(self.behaviours(scenarios), [each.described() for some in drawn for each in some])
 
     def archived(self, scenarios: Sequence[int]) -> list[ArchivedPolicy]:
-        """The task's policies that were refined beforehand, in these scenarios."""
-        policies = simulation.archived_policies(self.task)
-        return [self._archived(name, policy, scenarios) for name, policy in policies.items()]
+        """The task's policies that were refined beforehand, as they are and in archived modes, in these scenarios."""
+        return [self._archived(each, scenarios) for each in everything_archived(self.task)]
 
-    def _archived(self, name: str, policy: GaussianPolicy, scenarios: Sequence[int]) -> ArchivedPolicy:
-        kept_as = f"archived-{_weights_mark(policy)}"
-        driven = [self._driven(policy.mean, f"{kept_as}-{each}", each) for each in scenarios]
-        return ArchivedPolicy(policy, driven, simulation.surface_around(self.task, name))
+    def _archived(self, found: Archived, scenarios: Sequence[int]) -> ArchivedPolicy:
+        kept_as = f"archived-{weights_mark(found.policy, repr(found.mode).encode() if found.mode else b'')}"
+        exported = cache(found.exported)
+        driven = [self._driven(exported, f"{kept_as}-{each}", each) for each in scenarios]
+        return ArchivedPolicy(found.policy, driven, found.around, found.mode)
 
     def _reference(self, scenario: int) -> Trajectory:
-        return self._driven(simulation.reference_policy(self.task).mean, f"reference-{scenario}", scenario)
+        return self._driven(lambda: simulation.reference_policy(self.task).mean, f"reference-{scenario}", scenario)
 
     def _behaviours(self, scenario: int) -> list[Trajectory]:
         drawn = simulation.behaviours(self.task, scenario, BEHAVIOURS_PER_SCENARIO)
         return [self._behaviour(scenario, index, behaviour) for index, behaviour in enumerate(drawn)]
 
     def _behaviour(self, scenario: int, index: int, behaviour: Behaviour) -> Trajectory:
-        return self._driven(simulation.act_as(self.task, behaviour), f"behaviour-{scenario}-{index}", scenario)
+        return self._driven(lambda: simulation.act_as(self.task, behaviour), f"behaviour-{scenario}-{index}", scenario)
 
-    def _driven(self, act: Act, kept_as: str, scenario: int) -> Trajectory:
+    def _driven(self, act: Callable[[], Act], kept_as: str, scenario: int) -> Trajectory:
         path = self.directory / f"{kept_as}.npz"
         if not path.exists():
-            driven = simulation.run_episode(self.task, act, scenario)
+            driven = simulation.run_episode(self.task, act(), scenario)
             with written_whole(path) as draft:
                 driven.save(draft)
         return _load(path)
@@ -73,10 +73,10 @@ class RolloutCache:
 def policy_mark(task: str) -> str:
     """Eight characters that change with the task's frozen policy and with anything its description says."""
     description = repr(registry.task(task)).encode()
-    return _weights_mark(simulation.reference_policy(task), description)
+    return weights_mark(simulation.reference_policy(task), description)
 
 
-def _weights_mark(policy: ReferencePolicy, before: bytes = b"") -> str:
+def weights_mark(policy: ReferencePolicy, before: bytes = b"") -> str:
     mark = hashlib.sha256(before)
     for name, array in sorted(policy.weights.items()):
         mark.update(name.encode() + array.tobytes())

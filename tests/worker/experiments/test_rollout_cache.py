@@ -16,7 +16,7 @@ def test_rollouts_of_archived_policies_say_what_the_frozen_policy_would_have_don
     (name, policy), *_ = simulation.archived_policies("feeding").items()
     monkeypatch.setattr(simulation, "archived_policies", lambda task: {name: policy})
     for _ in ("driven", "kept"):
-        (archived,) = RolloutCache("feeding", tmp_path).archived([0])
+        archived, *_ = RolloutCache("feeding", tmp_path).archived([0])
         (driven,) = archived.driven
         frozen = simulation.reference_policy("feeding").mean(driven.observations[:-1])
         np.testing.assert_allclose(driven.reference_actions, frozen, atol=1e-6)

@@ -13,6 +13,7 @@ from app.storage import ArtefactStore
 from tests.worker import invented
 from worker.analysis.filters.promise import Outcome
 from worker.compute import simulation
+from worker.compute.archived import everything_archived
 from worker.compute.filter_fitting import FilterFit, driven_as
 from worker.compute.pools import Compute
 from worker.domain.scenarios import of_promise
@@ -69,8 +70,8 @@ def test_what_is_there_is_not_made_again(context: WorkerContext, monkeypatch: py
     for scenarios in reference_blocks("feeding", SETTINGS):
         context.references["feeding", scenarios] = []
     gate, *_ = reference_blocks("feeding", SETTINGS)
-    for name in simulation.archived_policies("feeding"):
-        context.references[driven_as("feeding", name), gate] = []
+    for each in everything_archived("feeding"):
+        context.references[driven_as("feeding", each.name), gate] = []
     met = [Outcome(0.0, 0.0, True)] * len(promise_block(SETTINGS, 5))
     context.outcomes["feeding", of_promise(5).start] = met
     cast("Compute", context.compute).close()

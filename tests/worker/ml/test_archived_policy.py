@@ -109,6 +109,27 @@ def test_it_begins_as_an_archived_policy_in_the_mode_that_the_person_wants_it_in
     np.testing.assert_array_equal([each.actions for each in again], [each.actions for each in driven])
 
 
+def test_what_archived_modes_did_is_known_and_not_driven_again(reference: list[Trajectory]) -> None:
+    plain, tried = explored(archived(moved(-0.5))), list[list[float]]()
+
+    def noting(act: Act, scenarios: Sequence[int], noise: float, seed: int) -> list[Trajectory]:
+        found = succeeding(act, scenarios, noise, seed)
+        tried.append([float(each.actions[:, 0].mean()) for each in found])
+        return found
+
+    (own, driven), *_ = best_archived(DISLIKES, NO_MODE, [plain], [], reference, noting)
+    sought = tried.copy()
+    known = ArchivedPolicy(plain.policy, driven, mode=own.weights.refined_mode)
+    tried.clear()
+    (start, _), *_ = best_archived(DISLIKES, NO_MODE, [plain, known], [], reference, noting)
+    assert start.weights.refined_mode
+    assert len(tried) < len(sought)
+
+    tried.clear()
+    best_archived(DISLIKES, NO_MODE, [plain, replace(known, driven=plain.driven)], [], reference, noting)
+    assert sought[0] not in tried, "a mode like it has come to nothing"
+
+
 def test_in_a_mode_that_loses_the_task_an_archived_policy_is_not_begun_as(reference: list[Trajectory]) -> None:
     plain = archived(moved(-0.5))
     (start, driven), *_ = best_archived(DISLIKES, NO_MODE, [explored(plain)], [], reference, failing)
@@ -241,7 +262,7 @@ def test_the_archived_policy_is_the_filter_where_the_refinement_has_found_none_b
     own = replace(NO_MODE, weights=FilterWeights(refined=moved(learned).weights))
     gated = gate_refined(DISLIKES, NO_MODE, best, [own], reference, lambda: reference, succeeding)
     assert gated.weights.refined is (own if is_own else best[0].draft).weights.refined
-    assert ("in a way of executing it" in gated.notes[-1]) != is_own
+    assert ("executed in another way" in gated.notes[-1]) != is_own
     assert gated.tested
 
 

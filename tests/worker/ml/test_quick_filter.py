@@ -10,6 +10,7 @@ from tests.worker.ml.test_pbarl import POLICY, World, problem, reference, surfac
 from worker.domain.scenarios import GATE, first_of
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
+from worker.ml.filters.exported.filter_module import FilterWeights
 from worker.ml.filters.fitting.filter_draft import FilterDraft
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.filters.fitting.response_surface import ResponseSurface
@@ -50,6 +51,20 @@ def test_nothing_is_driven_where_an_archived_policy_is_better_than_any_mode_that
     driven = World().collect(act_of(invented.TASK.modes, POLICY, found.weights), first_of(GATE, 6), 0.0, 0)
     for mine, theirs in zip(driven, slower.driven, strict=True):
         np.testing.assert_allclose(mine.actions, theirs.actions, atol=1e-6)
+
+
+def test_an_archived_policy_in_an_archived_mode_is_executed_in_it(
+    reference: list[Trajectory], surface: ResponseSurface
+) -> None:
+    slow = times(0.3)
+    mode = dict.fromkeys(invented.TASK.modes.names, 0.0) | {"speed_far": -0.9, "speed_near": -0.9}
+    weights = FilterWeights(refined=slow.policy.weights, refined_mode=mode)
+    driven = World().collect(act_of(invented.TASK.modes, POLICY, weights), first_of(GATE, 6), 0.0, 0)
+    in_mode = ArchivedPolicy(slow.policy, [replace(each, success=True) for each in driven], mode=mode)
+    found, world = quick(-1.0, [slow, in_mode], reference, surface)
+    assert not world.asked
+    assert (found.weights.refined, found.weights.refined_mode) == (slow.policy.weights, mode)
+    assert not quick(-1.0, [slow], reference, surface)[0].weights.refined_mode
 
 
 def test_a_mode_is_taken_where_it_is_better_than_what_is_archived(

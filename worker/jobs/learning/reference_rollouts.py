@@ -1,9 +1,14 @@
 """Made before the first filter waits for it: rollouts that are the same for everybody, and the graphs of exports."""
 
+from collections.abc import Callable
+from functools import cache
+from typing import TypeAlias
+
 from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
+from worker.compute.archived import everything_archived
 from worker.compute.filter_fitting import CHUNK, driven_as
 from worker.compute.pools import Computing, Lane
 from worker.domain.lab_modes import PolicyChoice
@@ -13,6 +18,9 @@ from worker.domain.type_aliases import Act
 from worker.jobs.learning.fits import filter_config, promise_of
 from worker.ml.filters.exported import filter_act
 from worker.tasks import registry
+
+_Driven: TypeAlias = tuple[str, Callable[[], Act], range]
+"""What rollouts are known as, what is driven, and where."""
 
 
 def make_ready(
@@ -31,12 +39,12 @@ def make_ready(
     policy = simulation.reference_policy(task)
     if settings.method is Method.STUDIO:
         filter_act.trace(registry.task(task).modes, policy)
-    first, *others = [(task, policy.mean, each) for each in reference_blocks(task, settings)]
-    for name, act, scenarios in [first, *_of_archived(task, settings), *others]:
+    frozen: list[_Driven] = [(task, lambda: policy.mean, each) for each in reference_blocks(task, settings)]
+    for name, act, scenarios in [*frozen[:1], *_of_archived(task, settings), *frozen[1:]]:
         key, made = (name, scenarios), list[Trajectory]()
         while key not in references and len(made) < len(scenarios):
             some = scenarios[len(made) : len(made) + CHUNK]
-            made += compute.run(Lane.PATIENT, _no_beat, learning.run_scenarios, task, act, some, 0.0, 0)
+            made += compute.run(Lane.PATIENT, _no_beat, learning.run_scenarios, task, act(), some, 0.0, 0)
         references.setdefault(key, made)
     for_promise = promise_block(settings, study_seed)
     place, met = (task, of_promise(study_seed).start), list[Outcome]()
@@ -59,12 +67,12 @@ def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     return [config.gate_block(description), *check, *home, evaluation]
 
 
-def _of_archived(task: str, settings: StudySettings) -> list[tuple[str, Act, range]]:
+def _of_archived(task: str, settings: StudySettings) -> list[_Driven]:
     """What policies that were refined beforehand have to be driven in, for whoever may get one of them."""
     if settings.method is not Method.STUDIO:
         return []
     gate = filter_config(settings).gate_block(registry.task(task))
-    return [(driven_as(task, name), each.mean, gate) for name, each in simulation.archived_policies(task).items()]
+    return [(driven_as(task, each.name), cache(each.exported), gate) for each in everything_archived(task)]
 
 
 def promise_block(settings: StudySettings, study_seed: int) -> range:

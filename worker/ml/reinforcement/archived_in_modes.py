@@ -87,23 +87,34 @@ class InModes:
         around: ResponseSurface,
         trial: GateTrial,
         wishes: FloatArray,
+        reference: Sequence[Trajectory],
+        archived: Sequence[tuple[FloatArray, Sequence[Trajectory]]] = (),
     ) -> None:
-        """``driven``, ``trial``: of the policy as it is; ``wishes``: (E, S) in the unit of the trial's preference."""
+        """``driven``, ``trial``: of the policy as it is; ``wishes``: (E, S) in the unit of the trial's preference.
+
+        ``reference``: rollouts of the frozen policy; ``archived``: of this one in modes that are archived.
+        """
         self.problem, self.driven, self.trial, self.wishes = problem, driven, trial, wishes
-        self.surface, self.forces, self.lost, self.tried = around, around.forces, 0, list[FloatArray]()
+        self.reference, self.surface, self.forces = reference, around, around.forces
+        self.lost, self.tried = 0, list[FloatArray]()
+        for mode, rollouts in archived:
+            self._learn(mode, rollouts)
         self._seek()
 
-    def observe(self, reference: Sequence[Trajectory], driven: Sequence[Trajectory], *, is_kept: bool) -> None:
+    def observe(self, driven: Sequence[Trajectory], *, is_kept: bool) -> None:
         """Learn from what came of the mode in the gate's scenarios, and seek another."""
-        changes = signal_changes(self.driven, driven)
-        self.surface = self.surface.with_observed(self.mode, changes, successes(driven))
-        growth_n = tail_growth_n(largest_forces(driven) - largest_forces(reference))
-        self.forces = self.forces.with_observed(self.mode, float(growth_n))
+        self._learn(self.mode, driven)
         self._seek_beside(is_kept=is_kept)
 
     def give_up(self) -> None:
         """Of a mode no more is known than that it loses too much: seek another."""
         self._seek_beside(is_kept=False)
+
+    def _learn(self, mode: FloatArray, driven: Sequence[Trajectory]) -> None:
+        changes = signal_changes(self.driven, driven)
+        self.surface = self.surface.with_observed(mode, changes, successes(driven))
+        growth_n = tail_growth_n(largest_forces(driven) - largest_forces(self.reference))
+        self.forces = self.forces.with_observed(mode, float(growth_n))
 
     def _seek_beside(self, *, is_kept: bool) -> None:
         self.tried.append(self.mode)

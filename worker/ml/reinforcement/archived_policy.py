@@ -8,8 +8,10 @@ surface around that policy foresees (decision 197).
 """
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from worker.domain.trajectory import Trajectory
 from worker.ml.filters.exported.filter_act import act_of
@@ -35,12 +37,14 @@ NEXT_BEST = 3
 
 @dataclass(frozen=True)
 class ArchivedPolicy:
-    """A policy that was refined for somebody else, and what it does in the gate's scenarios."""
+    """A policy that was refined for somebody else, as it is or in a mode, and what it does in the gate's scenarios."""
 
     policy: GaussianPolicy
     driven: Sequence[Trajectory]
     around: ResponseSurface | None = None
-    """of modes in which it is executed, beside itself; None: they were not explored"""
+    """of modes in which it is executed, beside itself; None: they were not explored, or it is in a mode already"""
+    mode: Mapping[str, float] = field(default_factory=dict)
+    """by the names of its axes; none: as it is"""
 
 
 def best_archived(
@@ -55,20 +59,21 @@ def best_archived(
 ) -> list[ArchivedDraft]:
     """The draft with the archived policies that the reward model likes best, the best first; none: its mode is better.
 
-    Policies are tried in modes, too, always the one of which most is foreseen in the mode that is best for this person.
-    Every trial says more of the modes around its policy, where another may be sought; where more is lost than by the
-    policy alone, another is sought more carefully, as the best of several tries is the luckiest, too. What has been
-    lost before is driven first, and those that lose it, too, are driven no further. Each policy is returned once, in
-    its best mode. ``known``: rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios;
-    ``beaten``: what has to be gained; None: what the draft's mode gains.
+    Policies are tried in other modes, too, always the one of which most is foreseen in the mode that is best for this
+    person. Every trial, and every archived mode, says more of the modes around its policy, where another may be sought;
+    where more is lost than by the policy alone, another is sought more carefully, as the best of several tries is the
+    luckiest, too. What has been lost before is driven first, and those that lose it, too, are driven no further. Each
+    policy is returned once in its best mode that was sought, or as it is, and once in each archived one. ``known``:
+    rollouts of many behaviours; ``reference``: of the frozen policy in the gate's scenarios; ``beaten``: what has to be
+    gained; None: what the draft's mode gains.
     """
     least = to_beat(problem, draft, reference) if beaten is None else beaten
     found, most = list[_Found](), least
     trials = [trial_of(problem, 1.0, 0.0, reference, each.driven) for each in archived]
     for each, trial in zip(archived, trials, strict=True):
         if trial.preference > least and keeps_task(problem, trial, reference):
-            in_no_mode = replace(draft, weights=draft.weights.changed(refined=each.policy.weights))
-            found.append(_Found(trial.preference, each, ArchivedDraft(in_no_mode, each.driven)))
+            weights = draft.weights.changed(refined=each.policy.weights, refined_mode=each.mode)
+            found.append(_Found(trial.preference, each, ArchivedDraft(replace(draft, weights=weights), each.driven)))
             most = max(most, trial.preference)
     explored = _in_modes(problem, archived, trials, known, reference)
     drives, whole = DoubtedFirst(problem, reference, collect), 0
@@ -91,7 +96,7 @@ def best_archived(
         if trial.preference > least and is_kept:
             found.append(_Found(trial.preference, policy, ArchivedDraft(replace(draft, weights=weights), driven)))
             most = max(most, trial.preference)
-        some.observe(reference, driven, is_kept=is_kept)
+        some.observe(driven, is_kept=is_kept)
     return _best_of_each(found)[: 1 + NEXT_BEST]
 
 
@@ -155,11 +160,16 @@ def _in_modes(
     if all(each.around is None for each in archived):
         return []
     wishes = problem.reward.signal_weights(known) / spread_of(problem.reward.member_returns(reference))
-    return [
-        (each, InModes(problem, each.driven, each.around, trial, wishes))
-        for each, trial in zip(archived, trials, strict=True)
-        if each.around is not None
-    ]
+    explored = list[tuple[ArchivedPolicy, InModes]]()
+    for each, trial in zip(archived, trials, strict=True):
+        if each.around is not None:
+            tried = [
+                (np.array(problem.task.modes.vector(other.mode)), other.driven)
+                for other in archived
+                if other.mode and other.policy is each.policy
+            ]
+            explored.append((each, InModes(problem, each.driven, each.around, trial, wishes, reference, tried)))
+    return explored
 
 
 def _foreseen(some: tuple[ArchivedPolicy, InModes]) -> float:

@@ -1,8 +1,8 @@
-"""A filter in a minute, for somebody who still answers: an archived policy as it is, or a mode where more is foreseen.
+"""A filter in a minute, for somebody who still answers: an archived policy, or a mode where more is foreseen.
 
-What an archived policy does is the same for everybody and known, success included, so that nothing has to be driven to
-choose among them for one person. Their last filter is sought longer: with a residual, and with archived policies in
-modes.
+What an archived policy does, as it is and in archived modes, is the same for everybody and known, success included, so
+that nothing has to be driven to choose among them for one person. Their last filter is sought longer: with a residual,
+and with archived policies in modes of the person's own.
 """
 
 import time
@@ -39,19 +39,19 @@ def quick_filter(
     Modes are driven only where the response surface foresees more of one than the best archived policy gains.
     """
     started = time.perf_counter()
-    best = _best_as_it_is(problem, archived, reference)
+    best = _best_archived(problem, archived, reference)
     least = best[1].preference if best else 0.0
     own = find_mode_quickly(problem, surface, pool, reference, collect, least, progress)
     if best and to_beat(problem, own, reference) < least:
         policy, trial = best
         shield = untried(problem.task.observation, problem.policy.action_size, reference)
-        weights = FilterWeights(refined=policy.policy.weights, shield=shield)
+        weights = FilterWeights(refined=policy.policy.weights, refined_mode=policy.mode, shield=shield)
         tested = limits_of(problem.task.observation, problem.task.action, policy.driven, reference)
         own = FilterDraft(weights, trials=(*own.trials, trial), notes=(ARCHIVED_NOTE,), tested=tested)
     return replace(own, notes=(*own.notes, _ON_THE_WAY)).timed("quick", started)
 
 
-def _best_as_it_is(
+def _best_archived(
     problem: FilterProblem, archived: Sequence[ArchivedPolicy], reference: Sequence[Trajectory]
 ) -> tuple[ArchivedPolicy, GateTrial] | None:
     """Of those that keep the task and are surely better than the reference policy; None: there is none."""

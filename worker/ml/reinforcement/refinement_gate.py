@@ -18,8 +18,8 @@ _REFINED = (
     "is shown, or as what was refined beforehand for people who mind one thing, and may have gone elsewhere since."
 )
 ARCHIVED_NOTE = (
-    "The filter is a policy that was refined beforehand for people who mind one thing, maybe in a way of executing it "
-    "that is this person's own."
+    "The filter is a policy that was refined beforehand for people who mind one thing, maybe executed in another way "
+    "that was chosen for this person."
 )
 _GIVEN_UP = "The refinement had made nothing better on the way and was given up."
 _DOUBTED = "The answers do not say clearly enough that the refined policy is better, and it is off."
