@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from worker.compute import simulation
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import untried
 from worker.ml.policies.gaussian import GaussianPolicy
 from worker.tasks import registry
 
@@ -33,12 +35,17 @@ class Archived:
     around: "ResponseSurface | None" = None
     """of other modes, beside the policy as it is; None where this is in a mode, and where none were explored"""
 
-    def exported(self) -> Act:
-        """It acts as a filter of such weights does; in a mode this takes a moment."""
+    def exported(self, reference: Sequence[Trajectory]) -> Act:
+        """The policy, or where it is in a mode a filter that does the same behind the shield of one that is untried.
+
+        ``reference``: the frozen policy's rollouts in the gate's scenarios, of which that shield is made.
+        """
         if not self.mode:
             return self.policy.mean
-        weights = FilterWeights(refined=self.policy.weights, refined_mode=self.mode)
-        return act_of(registry.task(self.task).modes, simulation.reference_policy(self.task), weights)
+        task, frozen = registry.task(self.task), simulation.reference_policy(self.task)
+        shield = untried(task.observation, frozen.action_size, reference)
+        weights = FilterWeights(refined=self.policy.weights, refined_mode=self.mode, shield=shield)
+        return act_of(task.modes, frozen, weights)
 
 
 def everything_archived(task: str) -> Sequence[Archived]:

@@ -185,8 +185,9 @@ class FilterFit:
         """What archived policies do in the gate's scenarios is the same for everybody, and made once per worker."""
         progress("looking at policies that were refined beforehand", 0.0)
         scenarios, found = self.problem.config.gate_block(self.problem.task), list[ArchivedPolicy]()
+        frozen = self._gate_reference()
         for each in everything_archived(self.task):
-            driven = self._driven(driven_as(self.task, each.name), each.exported, scenarios)
+            driven = self._driven(driven_as(self.task, each.name), partial(each.exported, frozen), scenarios)
             found.append(ArchivedPolicy(each.policy, driven, each.around, each.mode))
         return found
 

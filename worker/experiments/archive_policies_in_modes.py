@@ -1,12 +1,14 @@
 """Tries archived policies in modes that people would want: ``python -m worker archive-policies-in-modes --task NAME``.
 
-Of everybody drawn at random the best mode of the best policy is foreseen; those that are best for most who are left are
-driven, and archived if they keep the task. What is driven is kept, so an interrupted run goes on where it was.
+Of everybody drawn at random the best mode of the best policy is foreseen. What is best for most of them is driven, and
+archived if it keeps the task; what came of it says more of the modes around its policy, and where more was lost others
+are sought more carefully. What is driven is kept, so an interrupted run goes on where it was.
 """
 
 import json
 import platform
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +25,41 @@ from worker.experiments.fit_response_surface import somebody
 from worker.experiments.rollout_cache import RolloutCache, weights_mark
 from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.gate import largest_forces, signal_changes, successes
+from worker.ml.filters.fitting.mode_archive import tail_growth_n
 from worker.ml.filters.fitting.response_surface import ResponseSurface, best_mode
+from worker.ml.policies.gaussian import GaussianPolicy
 from worker.tasks import registry
 from worker.whole_files import written_whole
 
 PEOPLE = 96
-"""drawn at random, each of whom gives one mode of one policy"""
-MOST_TRIED, MOST_KEPT = 24, 12
+"""drawn at random, each of whom wants one mode of one policy"""
+MOST_TRIED, MOST_KEPT = 30, 12
 LEAST_GAIN = 0.002
-"""of what people could gain, in the mean, that a mode has to add"""
-SUCCESS_CAUTION = 3.0
-"""standard deviations less success than is foreseen: of modes that were sought with one, many lost the task"""
+"""of what is foreseen for people at best, in the mean, that a mode has to add"""
 
 
 class NoPolicies(ValueError):
     """There is nothing to try modes of."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What a policy changes beside the frozen one, in the mean over scenarios."""
+
+    scenarios: int
+    signals: tuple[float, ...]
+    """(S,) summed over an episode"""
+    succeeded: int
+    failed: float
+    """share of scenarios by which more fail"""
+    pressed: float
+    """share of scenarios in which somebody is pressed much harder"""
+    force_growth_n: float
+    """see tail_growth_n()"""
+
+    def keeps_task(self, alone: "Driven") -> bool:
+        """Whether next to nothing is lost; of pressing no more than by the policy alone, either."""
+        return self.failed <= LARGEST_LOSS and self.pressed <= max(LARGEST_LOSS, alone.pressed)
 
 
 def archive_policies_in_modes(
@@ -49,35 +71,30 @@ def archive_policies_in_modes(
     """
     torch.set_num_threads(1)
     policies = simulation.archived_policies(task)
-    around = {name: surface for name in policies if (surface := simulation.surface_around(task, name))}
-    if not around:
+    surfaces = {name: surface for name in policies if (surface := simulation.surface_around(task, name))}
+    if not surfaces:
         raise NoPolicies(f"There are no policies; `python -m worker archive-policies --task {task}` refines some.")
-    trials = _Trials(task, work, scenarios)
-    as_they_are = {
-        name: trials.drive(Archived(task, name, policies[name])) for name in tqdm(around, desc="as they are")
-    }
-    wants = _wants(task, people)
-    asked = [_best(number, wants[number], as_they_are, around) for number in tqdm(range(people), desc="people")]
-    foreseen = np.array([each["signals"] for each in asked])
-    alone = wants @ np.array([each["signals"] for each in as_they_are.values()]).T
-    reached = np.maximum(alone.max(axis=1), 0.0)
-    unit = np.maximum(np.maximum(reached, (wants @ foreseen.T).max(axis=1)), 1e-9)
-    found, left = list[dict[str, Any]](), list(range(people))
-    with tqdm(total=tried, desc="modes") as bar:
-        while left and len(found) < tried and sum(each["kept"] for each in found) < MOST_KEPT:
-            added = (np.maximum(wants @ foreseen[left].T - reached[:, None], 0.0) / unit[:, None]).mean(axis=0)
-            if added.max() < LEAST_GAIN:
-                break
-            chosen = asked[left.pop(int(added.argmax()))]
-            name, mode = chosen["policy"], chosen["mode"]
-            driven = trials.drive(Archived(task, name, policies[name], mode))
-            is_kept = max(driven["failed"], driven["pressed"]) <= LARGEST_LOSS
-            if is_kept:
-                reached = np.maximum(reached, wants @ np.array(driven["signals"]))
-            share = float((reached / unit).mean())
-            counts = {each: driven[each] for each in ("failed", "pressed")}
-            found.append({"policy": name, "mode": mode, **counts, "kept": is_kept, "reached": round(share, 4)})
-            bar.update()
+    trials, wants = _Trials(task, work, scenarios), _wants(task, people)
+    bar = tqdm(total=len(surfaces) + tried, unit="mode", desc="tried")
+    around = list[_Around]()
+    for name, surface in surfaces.items():
+        around.append(_Around(name, policies[name], surface, trials.drive(Archived(task, name, policies[name])), wants))
+        bar.update()
+    reached = np.maximum(np.max([wants @ each.alone.signals for each in around], axis=0), 0.0)
+    found = list[dict[str, Any]]()
+    while len(found) < tried and sum(each["kept"] for each in found) < MOST_KEPT:
+        chosen, mode = _best_for_most(around, wants, reached)
+        if chosen is None:
+            break
+        driven = trials.drive(Archived(task, chosen.name, chosen.policy, mode))
+        is_kept = driven.keeps_task(chosen.alone)
+        if is_kept:
+            reached = np.maximum(reached, wants @ driven.signals)
+        chosen.observe(mode, driven, is_kept=is_kept)
+        counts = {"failed": driven.failed, "pressed": driven.pressed, "kept": is_kept}
+        found.append({"policy": chosen.name, "mode": mode, **counts})
+        bar.update()
+    bar.close()
     record = {
         "command": f"python -m worker archive-policies-in-modes --task {task}",
         "people": people,
@@ -98,24 +115,58 @@ def _wants(task: str, people: int) -> FloatArray:
     return np.array([somebody(described, surface, rng) for _ in range(people)])
 
 
-def _best(
-    seed: int, wants: FloatArray, as_they_are: Mapping[str, Mapping[str, Any]], around: Mapping[str, ResponseSurface]
-) -> dict[str, Any]:
-    """The best mode of the best policy for one person, and what is foreseen to change of the signals."""
-    found = list[tuple[float, dict[str, Any]]]()
-    for name, surface in around.items():
-        mode = best_mode(
-            surface,
-            wants,
-            seed,
-            success_caution=SUCCESS_CAUTION,
-            forces=surface.forces,
-            most_growth_n=FilterConfig().pressed_n,
-        )
-        signals = np.array(as_they_are[name]["signals"]) + surface.predict(mode)[0]
-        named = {axis: round(float(at), 4) for axis, at in zip(surface.axes, mode, strict=True)}
-        found.append((float(signals @ wants), {"policy": name, "mode": named, "signals": signals}))
-    return max(found, key=lambda each: each[0])[1]
+class _Around:
+    """An archived policy, and the mode of it that is best for each of the people by what is known so far."""
+
+    def __init__(
+        self, name: str, policy: GaussianPolicy, surface: ResponseSurface, alone: Driven, wants: FloatArray
+    ) -> None:
+        self.name, self.policy, self.alone, self.wants = name, policy, alone, wants
+        self.surface, self.forces, self.lost, self.tried = surface, surface.forces, 0, list[dict[str, float]]()
+        self._seek()
+
+    def observe(self, mode: dict[str, float], driven: Driven, *, is_kept: bool) -> None:
+        """Learn from what came of a mode, and seek everybody's anew."""
+        at = np.array([mode[axis] for axis in self.surface.axes])
+        changes = np.tile(np.subtract(driven.signals, self.alone.signals), (driven.scenarios, 1))
+        succeeded = np.repeat([1.0, 0.0], [driven.succeeded, driven.scenarios - driven.succeeded])
+        self.surface = self.surface.with_observed(at, changes, succeeded)
+        self.forces = self.forces.with_observed(at, driven.force_growth_n)
+        self.tried.append(mode)
+        self.lost += not is_kept
+        self._seek()
+
+    def _seek(self) -> None:
+        """More carefully about success, the more were tried that lost too much."""
+        config = FilterConfig()
+        modes = [
+            best_mode(
+                self.surface,
+                wants,
+                seed,
+                success_caution=config.success_caution * (1 + self.lost),
+                forces=self.forces,
+                most_growth_n=config.pressed_n,
+            )
+            for seed, wants in enumerate(self.wants)
+        ]
+        self.modes = [{axis: round(float(x), 4) for axis, x in zip(self.surface.axes, at, strict=True)} for at in modes]
+        self.signals = np.array(self.alone.signals) + self.surface.predict(np.array(modes))[0]
+        self.is_new = np.array([any(mode.values()) and mode not in self.tried for mode in self.modes])
+
+
+def _best_for_most(
+    around: list[_Around], wants: FloatArray, reached: FloatArray
+) -> tuple[_Around | None, dict[str, float]]:
+    """The mode that is foreseen to add most to what people have reached; none where that is next to nothing."""
+    signals = np.concatenate([each.signals[each.is_new] for each in around])
+    of = [(each, mode) for each in around for mode, is_new in zip(each.modes, each.is_new, strict=True) if is_new]
+    if not of:
+        return None, {}
+    foreseen = wants @ signals.T
+    best = np.maximum(np.maximum(reached, foreseen.max(axis=1)), 1e-9)
+    added = (np.maximum(foreseen - reached[:, None], 0.0) / best[:, None]).mean(axis=0)
+    return of[int(added.argmax())] if added.max() >= LEAST_GAIN else (None, {})
 
 
 class _Trials:
@@ -124,24 +175,29 @@ class _Trials:
     def __init__(self, task: str, work: Path, scenarios: int) -> None:
         self.task, self.work = task, work
         self.scenarios = first_of(POLICY_TEST, scenarios)
-        self.reference = RolloutCache(task, work / "rollouts").reference(self.scenarios)
+        rollouts = RolloutCache(task, work / "rollouts")
+        self.reference = rollouts.reference(self.scenarios)
+        self.gate_reference = rollouts.reference(FilterConfig().gate_block(registry.task(task)))
 
-    def drive(self, tried: Archived) -> dict[str, Any]:
-        """What changes of the summed signals in the mean, and in what shares of scenarios the task or somebody suffers.
-
-        ``failed``: how many more fail; ``pressed``: in how many somebody is pressed much harder.
-        """
+    def drive(self, tried: Archived) -> Driven:
+        """Drive it, unless that was done."""
         marked = weights_mark(tried.policy, repr(tried.mode).encode())
         kept = self.work / f"{tried.name}-{marked}-{len(self.scenarios)}.json"
         if not kept.exists():
-            driven = learning.run_scenarios(self.task, tried.exported(), self.scenarios, 0.0, 0)
-            growth = largest_forces(driven) - largest_forces(self.reference)
-            found = {
-                "signals": signal_changes(self.reference, driven).mean(axis=0).tolist(),
-                "failed": round(float((successes(self.reference) - successes(driven)).mean()), 4),
-                "pressed": round(float((growth > FilterConfig().pressed_n).mean()), 4),
-            }
+            found = self._driven(tried)
             with written_whole(kept) as draft:
-                draft.write_text(json.dumps(found))
-        known: dict[str, Any] = json.loads(kept.read_text())
-        return known
+                draft.write_text(json.dumps(asdict(found)))
+        stored: Mapping[str, Any] = json.loads(kept.read_text())
+        return Driven(**{**stored, "signals": tuple(stored["signals"])})
+
+    def _driven(self, tried: Archived) -> Driven:
+        driven = learning.run_scenarios(self.task, tried.exported(self.gate_reference), self.scenarios, 0.0, 0)
+        growth = largest_forces(driven) - largest_forces(self.reference)
+        return Driven(
+            len(driven),
+            tuple(signal_changes(self.reference, driven).mean(axis=0).tolist()),
+            int(successes(driven).sum()),
+            round(float((successes(self.reference) - successes(driven)).mean()), 4),
+            round(float((growth > FilterConfig().pressed_n).mean()), 4),
+            float(tail_growth_n(growth)),
+        )

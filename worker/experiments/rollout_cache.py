@@ -10,6 +10,7 @@ from worker.compute.archived import Archived, everything_archived
 from worker.compute.behaviours import Behaviour
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import Act
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.ml.filters.fitting.pool import Pool
 from worker.ml.policies.reference import ReferencePolicy
 from worker.ml.reinforcement.archived_policy import ArchivedPolicy
@@ -47,7 +48,8 @@ class RolloutCache:
 
     def _archived(self, found: Archived, scenarios: Sequence[int]) -> ArchivedPolicy:
         kept_as = f"archived-{weights_mark(found.policy, repr(found.mode).encode() if found.mode else b'')}"
-        exported = cache(found.exported)
+        gate = FilterConfig().gate_block(registry.task(self.task))
+        exported = cache(lambda: found.exported(self.reference(gate)))
         driven = [self._driven(exported, f"{kept_as}-{each}", each) for each in scenarios]
         return ArchivedPolicy(found.policy, driven, found.around, found.mode)
 

@@ -16,6 +16,8 @@ from worker.experiments import archive_policies_in_modes
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
+from worker.ml.filters.exported.shield import untried
+from worker.ml.filters.fitting.filter_problem import FilterConfig
 from worker.tasks import registry
 
 SHIPPED = [name for name in catalogue.names() if simulation.archived_modes_file(name).exists()]
@@ -36,9 +38,13 @@ def test_what_keeps_the_task_is_archived_and_driven_once(tmp_path: Path, monkeyp
     assert all(each["failed"] <= 0.005 and each["pressed"] <= 0.005 for each in kept)
     found = [each for each in everything_archived("scratching") if each.mode]
     assert [(each.policy, each.mode) for each in found] == [(policies[each["policy"]], each["mode"]) for each in kept]
-    (rollout,) = RolloutCache("scratching", tmp_path / "rollouts").archived([7])[len(policies)].driven
-    weights = FilterWeights(refined=found[0].policy.weights, refined_mode=found[0].mode)
-    act = act_of(registry.task("scratching").modes, simulation.reference_policy("scratching"), weights)
+    task, frozen = registry.task("scratching"), simulation.reference_policy("scratching")
+    rollouts = RolloutCache("scratching", tmp_path / "rollouts")
+    (rollout,) = rollouts.archived([7])[len(policies)].driven
+    shield = untried(task.observation, frozen.action_size, rollouts.reference(FilterConfig().gate_block(task)))
+    weights = FilterWeights(refined=found[0].policy.weights, refined_mode=found[0].mode, shield=shield)
+    assert shield, "no touch is much harder than the frozen policy's"
+    act = act_of(task.modes, frozen, weights)
     (again,) = learning.run_scenarios("scratching", act, [7], 0.0, 0)
     np.testing.assert_array_equal(rollout.actions, again.actions)
 
@@ -52,6 +58,8 @@ def test_what_loses_the_task_or_presses_somebody_is_told_and_not_archived(
     monkeypatch.setattr(archive_policies_in_modes, "LARGEST_LOSS", -2.0)
     record = tried(tmp_path, monkeypatch)
     assert [each["kept"] for each in record["modes"]] == [False, False]
+    first, second = (each["mode"] for each in record["modes"])
+    assert first != second
     assert not [each for each in everything_archived("scratching") if each.mode]
 
 

@@ -1,6 +1,6 @@
 """Made before the first filter waits for it: rollouts that are the same for everybody, and the graphs of exports."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import TypeAlias
 
@@ -8,7 +8,7 @@ from app.domain.choices import Method
 from app.domain.study_settings import StudySettings
 from worker.analysis.filters.promise import Outcome
 from worker.compute import learning, simulation
-from worker.compute.archived import everything_archived
+from worker.compute.archived import Archived, everything_archived
 from worker.compute.filter_fitting import CHUNK, driven_as
 from worker.compute.pools import Computing, Lane
 from worker.domain.lab_modes import PolicyChoice
@@ -40,7 +40,7 @@ def make_ready(
     if settings.method is Method.STUDIO:
         filter_act.trace(registry.task(task).modes, policy)
     frozen: list[_Driven] = [(task, lambda: policy.mean, each) for each in reference_blocks(task, settings)]
-    for name, act, scenarios in [*frozen[:1], *_of_archived(task, settings), *frozen[1:]]:
+    for name, act, scenarios in [*frozen[:1], *_of_archived(task, settings, references), *frozen[1:]]:
         key, made = (name, scenarios), list[Trajectory]()
         while key not in references and len(made) < len(scenarios):
             some = scenarios[len(made) : len(made) + CHUNK]
@@ -67,12 +67,18 @@ def reference_blocks(task: str, settings: StudySettings) -> list[range]:
     return [config.gate_block(description), *check, *home, evaluation]
 
 
-def _of_archived(task: str, settings: StudySettings) -> list[_Driven]:
+def _of_archived(
+    task: str, settings: StudySettings, references: Mapping[tuple[str, range], Sequence[Trajectory]]
+) -> list[_Driven]:
     """What policies that were refined beforehand have to be driven in, for whoever may get one of them."""
     if settings.method is not Method.STUDIO:
         return []
     gate = filter_config(settings).gate_block(registry.task(task))
-    return [(driven_as(task, each.name), cache(each.exported), gate) for each in everything_archived(task)]
+
+    def driven(each: Archived) -> _Driven:
+        return driven_as(task, each.name), cache(lambda: each.exported(references[task, gate])), gate
+
+    return [driven(each) for each in everything_archived(task)]
 
 
 def promise_block(settings: StudySettings, study_seed: int) -> range:
