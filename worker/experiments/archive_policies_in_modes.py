@@ -7,8 +7,8 @@ are sought more carefully. What is driven is kept, so an interrupted run goes on
 
 import json
 import platform
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from tqdm import tqdm
 from worker.compute import learning, simulation
 from worker.compute.archived import Archived
 from worker.domain.scenarios import POLICY_TEST, first_of
+from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
 from worker.experiments.archive_policies import LARGEST_LOSS, TEST_SCENARIOS
 from worker.experiments.fit_response_surface import somebody
@@ -36,6 +37,10 @@ PEOPLE = 96
 MOST_TRIED, MOST_KEPT = 30, 12
 LEAST_GAIN = 0.002
 """of what is foreseen for people at best, in the mean, that a mode has to add"""
+
+
+AT_ONCE = 100
+"""scenarios, after which what has lost more than can be won back is driven no further"""
 
 
 class NoPolicies(ValueError):
@@ -56,6 +61,12 @@ class Driven:
     """share of scenarios in which somebody is pressed much harder"""
     force_growth_n: float
     """see tail_growth_n()"""
+
+    def at_best(self, left: Sequence[Trajectory], total: int) -> "Driven":
+        """What it will be once it is driven through all scenarios, if it loses nothing in those that are ``left``."""
+        won = sum(not reference.success for reference in left)
+        share = self.scenarios / total
+        return replace(self, failed=share * self.failed - won / total, pressed=share * self.pressed)
 
     def keeps_task(self, alone: "Driven") -> bool:
         """Whether next to nothing is lost; of pressing no more than by the policy alone, either."""
@@ -86,7 +97,7 @@ def archive_policies_in_modes(
         chosen, mode = _best_for_most(around, wants, reached)
         if chosen is None:
             break
-        driven = trials.drive(Archived(task, chosen.name, chosen.policy, mode))
+        driven = trials.drive(Archived(task, chosen.name, chosen.policy, mode), chosen.alone)
         is_kept = driven.keeps_task(chosen.alone)
         if is_kept:
             reached = np.maximum(reached, wants @ driven.signals)
@@ -179,25 +190,36 @@ class _Trials:
         self.reference = rollouts.reference(self.scenarios)
         self.gate_reference = rollouts.reference(FilterConfig().gate_block(registry.task(task)))
 
-    def drive(self, tried: Archived) -> Driven:
-        """Drive it, unless that was done."""
+    def drive(self, tried: Archived, alone: Driven | None = None) -> Driven:
+        """Drive it, unless that was done; beside its policy ``alone`` no further once it has lost too much."""
         marked = weights_mark(tried.policy, repr(tried.mode).encode())
         kept = self.work / f"{tried.name}-{marked}-{len(self.scenarios)}.json"
         if not kept.exists():
-            found = self._driven(tried)
+            found = self._driven(tried, alone)
             with written_whole(kept) as draft:
                 draft.write_text(json.dumps(asdict(found)))
         stored: Mapping[str, Any] = json.loads(kept.read_text())
         return Driven(**{**stored, "signals": tuple(stored["signals"])})
 
-    def _driven(self, tried: Archived) -> Driven:
-        driven = learning.run_scenarios(self.task, tried.exported(self.gate_reference), self.scenarios, 0.0, 0)
-        growth = largest_forces(driven) - largest_forces(self.reference)
+    def _driven(self, tried: Archived, alone: Driven | None) -> Driven:
+        act, rollouts = tried.exported(self.gate_reference), list[Trajectory]()
+        while True:
+            some = self.scenarios[len(rollouts) : len(rollouts) + AT_ONCE]
+            rollouts += learning.run_scenarios(self.task, act, some, 0.0, 0)
+            found = self._said(rollouts)
+            left, total = self.reference[len(rollouts) :], len(self.scenarios)
+            if not left or (alone and not found.at_best(left, total).keeps_task(alone)):
+                return found
+
+    def _said(self, driven: Sequence[Trajectory]) -> Driven:
+        """By rollouts in the first scenarios."""
+        reference = self.reference[: len(driven)]
+        growth = largest_forces(driven) - largest_forces(reference)
         return Driven(
             len(driven),
-            tuple(signal_changes(self.reference, driven).mean(axis=0).tolist()),
+            tuple(signal_changes(reference, driven).mean(axis=0).tolist()),
             int(successes(driven).sum()),
-            round(float((successes(self.reference) - successes(driven)).mean()), 4),
+            round(float((successes(reference) - successes(driven)).mean()), 4),
             round(float((growth > FilterConfig().pressed_n).mean()), 4),
             float(tail_growth_n(growth)),
         )

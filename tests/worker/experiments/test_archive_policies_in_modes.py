@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from app.installed_tasks import catalogue
+from tests.worker.waving import waving_trajectory
 from worker.__main__ import main
 from worker.compute import learning, simulation
 from worker.compute.archived import everything_archived
 from worker.experiments import archive_policies_in_modes
+from worker.experiments.archive_policies_in_modes import Driven
 from worker.experiments.rollout_cache import RolloutCache
 from worker.ml.filters.exported.filter_act import act_of
 from worker.ml.filters.exported.filter_module import FilterWeights
@@ -94,3 +97,15 @@ def test_those_that_ship_are_of_their_task_and_keep_it(task: str) -> None:
     for each in found:
         at = np.array(modes.vector(each.mode))
         assert all(axis.low <= value <= axis.high for axis, value in zip(modes.axes, at, strict=True))
+
+
+def test_what_has_lost_too_much_is_driven_no_further_unless_it_can_win_that_back() -> None:
+    alone = Driven(500, (), 490, failed=0.0, pressed=0.0, force_growth_n=0.0)
+    done, failed = (replace(waving_trajectory(2), success=success) for success in (True, False))
+    two = Driven(100, (), 97, failed=0.02, pressed=0.0, force_growth_n=0.0)
+    three = replace(two, failed=0.03)
+    assert two.at_best([done] * 400, 500).keeps_task(alone), "two of 500 are within half a point"
+    assert not three.at_best([done] * 400, 500).keeps_task(alone)
+    assert three.at_best([*[done] * 399, failed], 500).keeps_task(alone)
+    assert not replace(two, pressed=0.03).at_best([*[done] * 399, failed], 500).keeps_task(alone)
+    assert replace(two, pressed=0.03).at_best([done] * 400, 500).keeps_task(replace(alone, pressed=0.006))
