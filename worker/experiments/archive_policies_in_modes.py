@@ -21,7 +21,7 @@ from worker.compute.archived import Archived
 from worker.domain.scenarios import POLICY_TEST, first_of
 from worker.domain.trajectory import Trajectory
 from worker.domain.type_aliases import FloatArray
-from worker.experiments.archive_policies import LARGEST_LOSS, TEST_SCENARIOS
+from worker.experiments.archive_policies import TEST_SCENARIOS
 from worker.experiments.fit_response_surface import somebody
 from worker.experiments.rollout_cache import RolloutCache, weights_mark
 from worker.ml.filters.fitting.filter_problem import FilterConfig
@@ -34,7 +34,9 @@ from worker.whole_files import written_whole
 
 PEOPLE = 96
 """drawn at random, each of whom wants one mode of one policy"""
-MOST_TRIED, MOST_KEPT = 30, 12
+MOST_TRIED, MOST_KEPT = 60, 12
+LARGEST_LOSS = 0.01
+"""of success, as of a filter that was sought for somebody; and in how much of the scenarios somebody may be pressed"""
 LEAST_GAIN = 0.002
 """of what is foreseen for people at best, in the mean, that a mode has to add"""
 

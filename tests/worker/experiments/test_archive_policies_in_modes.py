@@ -38,7 +38,7 @@ def test_what_keeps_the_task_is_archived_and_driven_once(tmp_path: Path, monkeyp
     policies = simulation.archived_policies("scratching")
     kept = [each for each in record["modes"] if each["kept"]]
     assert kept, "two scenarios are easy"
-    assert all(each["failed"] <= 0.005 and each["pressed"] <= 0.005 for each in kept)
+    assert all(each["failed"] <= 0.01 for each in kept)
     found = [each for each in everything_archived("scratching") if each.mode]
     assert [(each.policy, each.mode) for each in found] == [(policies[each["policy"]], each["mode"]) for each in kept]
     task, frozen = registry.task("scratching"), simulation.reference_policy("scratching")
@@ -93,7 +93,7 @@ def test_those_that_ship_are_of_their_task_and_keep_it(task: str) -> None:
     assert record["command"] == f"python -m worker archive-policies-in-modes --task {task}"
     found = [each for each in everything_archived(task) if each.mode]
     assert len(found) == sum(each["kept"] for each in record["modes"]) > 0
-    assert all(each["failed"] <= 0.005 and each["pressed"] <= 0.005 for each in record["modes"] if each["kept"])
+    assert all(each["failed"] <= 0.01 for each in record["modes"] if each["kept"])
     for each in found:
         at = np.array(modes.vector(each.mode))
         assert all(axis.low <= value <= axis.high for axis, value in zip(modes.axes, at, strict=True))
@@ -102,10 +102,10 @@ def test_those_that_ship_are_of_their_task_and_keep_it(task: str) -> None:
 def test_what_has_lost_too_much_is_driven_no_further_unless_it_can_win_that_back() -> None:
     alone = Driven(500, (), 490, failed=0.0, pressed=0.0, force_growth_n=0.0)
     done, failed = (replace(waving_trajectory(2), success=success) for success in (True, False))
-    two = Driven(100, (), 97, failed=0.02, pressed=0.0, force_growth_n=0.0)
-    three = replace(two, failed=0.03)
-    assert two.at_best([done] * 400, 500).keeps_task(alone), "two of 500 are within half a point"
-    assert not three.at_best([done] * 400, 500).keeps_task(alone)
-    assert three.at_best([*[done] * 399, failed], 500).keeps_task(alone)
-    assert not replace(two, pressed=0.03).at_best([*[done] * 399, failed], 500).keeps_task(alone)
-    assert replace(two, pressed=0.03).at_best([done] * 400, 500).keeps_task(replace(alone, pressed=0.006))
+    five = Driven(100, (), 93, failed=0.05, pressed=0.0, force_growth_n=0.0)
+    six = replace(five, failed=0.06)
+    assert five.at_best([done] * 400, 500).keeps_task(alone), "five of 500 are one in a hundred"
+    assert not six.at_best([done] * 400, 500).keeps_task(alone)
+    assert six.at_best([*[done] * 399, failed], 500).keeps_task(alone)
+    assert not replace(five, pressed=0.06).at_best([*[done] * 399, failed], 500).keeps_task(alone)
+    assert replace(five, pressed=0.06).at_best([done] * 400, 500).keeps_task(replace(alone, pressed=0.012))
