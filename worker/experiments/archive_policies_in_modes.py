@@ -67,8 +67,8 @@ class Driven:
     def at_best(self, left: Sequence[Trajectory], total: int) -> "Driven":
         """What it will be once it is driven through all scenarios, if it loses nothing in those that are ``left``."""
         won = sum(not reference.success for reference in left)
-        share = self.scenarios / total
-        return replace(self, failed=share * self.failed - won / total, pressed=share * self.pressed)
+        failed, pressed = (round(share * self.scenarios) for share in (self.failed, self.pressed))
+        return replace(self, failed=(failed - won) / total, pressed=pressed / total)
 
     def keeps_task(self, alone: "Driven") -> bool:
         """Whether next to nothing is lost; of pressing no more than by the policy alone, either."""
