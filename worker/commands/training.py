@@ -103,7 +103,7 @@ def _archive_policies(said: argparse.Namespace) -> int:
 
 
 def _archive_policies_in_modes(said: argparse.Namespace) -> int:
-    """Try archived policies in modes that people would want, half an hour to an hour; what was driven is kept."""
+    """Try archived policies in modes that people would want, once for everybody; what was driven is kept."""
     work = said.work_directory or Settings().data_dir / "archive-policies-in-modes" / said.task
     try:
         record = archive_policies_in_modes.archive_policies_in_modes(said.task, work)

@@ -7,8 +7,8 @@ are sought more carefully. What is driven is kept, so an interrupted run goes on
 
 import json
 import platform
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,9 @@ PEOPLE = 96
 """drawn at random, each of whom wants one mode of one policy"""
 MOST_TRIED, MOST_KEPT = 60, 12
 LARGEST_LOSS = 0.01
-"""of success, as of a filter that was sought for somebody; and in how much of the scenarios somebody may be pressed"""
+"""of success, as of a filter that was sought for somebody; and share of scenarios in which somebody may be pressed"""
 LEAST_GAIN = 0.002
 """of what is foreseen for people at best, in the mean, that a mode has to add"""
-
-
 AT_ONCE = 100
 """scenarios, after which what has lost more than can be won back is driven no further"""
 
@@ -51,28 +49,29 @@ class NoPolicies(ValueError):
 
 @dataclass(frozen=True)
 class Driven:
-    """What a policy changes beside the frozen one, in the mean over scenarios."""
+    """What a policy changes beside the frozen one in N scenarios: all, or those in which it has lost too much."""
 
-    scenarios: int
-    signals: tuple[float, ...]
-    """(S,) summed over an episode"""
-    succeeded: int
-    failed: float
-    """share of scenarios by which more fail"""
-    pressed: float
-    """share of scenarios in which somebody is pressed much harder"""
-    force_growth_n: float
-    """see tail_growth_n()"""
+    signals: FloatArray
+    """(N, S) summed over an episode"""
+    succeeded: FloatArray
+    """(N,) in {0, 1}"""
+    failed: int
+    """how many more fail"""
+    growth_n: FloatArray
+    """(N,) of the largest force on the person"""
 
-    def at_best(self, left: Sequence[Trajectory], total: int) -> "Driven":
-        """What it will be once it is driven through all scenarios, if it loses nothing in those that are ``left``."""
-        won = sum(not reference.success for reference in left)
-        failed, pressed = (round(share * self.scenarios) for share in (self.failed, self.pressed))
-        return replace(self, failed=(failed - won) / total, pressed=pressed / total)
+    @property
+    def pressed(self) -> int:
+        """In how many somebody is pressed much harder."""
+        return int((self.growth_n > FilterConfig().pressed_n).sum())
 
-    def keeps_task(self, alone: "Driven") -> bool:
-        """Whether next to nothing is lost; of pressing no more than by the policy alone, either."""
-        return self.failed <= LARGEST_LOSS and self.pressed <= max(LARGEST_LOSS, alone.pressed)
+    def keeps_task(self, alone: "Driven", winnable: int = 0) -> bool:
+        """Whether next to nothing is lost of all that ``alone`` was driven through, and nobody is pressed more than so.
+
+        ``winnable``: in how many of those that are left the frozen policy fails.
+        """
+        allowed = round(LARGEST_LOSS * len(alone.signals))
+        return self.failed - winnable <= allowed and self.pressed <= max(allowed, alone.pressed)
 
 
 def archive_policies_in_modes(
@@ -93,7 +92,7 @@ def archive_policies_in_modes(
     for name, surface in surfaces.items():
         around.append(_Around(name, policies[name], surface, trials.drive(Archived(task, name, policies[name])), wants))
         bar.update()
-    reached = np.maximum(np.max([wants @ each.alone.signals for each in around], axis=0), 0.0)
+    reached = np.maximum(np.max([wants @ each.alone.signals.mean(axis=0) for each in around], axis=0), 0.0)
     found = list[dict[str, Any]]()
     while len(found) < tried and sum(each["kept"] for each in found) < MOST_KEPT:
         chosen, mode = _best_for_most(around, wants, reached)
@@ -102,10 +101,10 @@ def archive_policies_in_modes(
         driven = trials.drive(Archived(task, chosen.name, chosen.policy, mode), chosen.alone)
         is_kept = driven.keeps_task(chosen.alone)
         if is_kept:
-            reached = np.maximum(reached, wants @ driven.signals)
+            reached = np.maximum(reached, wants @ driven.signals.mean(axis=0))
         chosen.observe(mode, driven, is_kept=is_kept)
-        counts = {"failed": driven.failed, "pressed": driven.pressed, "kept": is_kept}
-        found.append({"policy": chosen.name, "mode": mode, **counts})
+        counts = {"scenarios": len(driven.signals), "failed": driven.failed, "pressed": driven.pressed}
+        found.append({"policy": chosen.name, "mode": mode, **counts, "kept": is_kept})
         bar.update()
     bar.close()
     record = {
@@ -141,10 +140,9 @@ class _Around:
     def observe(self, mode: dict[str, float], driven: Driven, *, is_kept: bool) -> None:
         """Learn from what came of a mode, and seek everybody's anew."""
         at = np.array([mode[axis] for axis in self.surface.axes])
-        changes = np.tile(np.subtract(driven.signals, self.alone.signals), (driven.scenarios, 1))
-        succeeded = np.repeat([1.0, 0.0], [driven.succeeded, driven.scenarios - driven.succeeded])
-        self.surface = self.surface.with_observed(at, changes, succeeded)
-        self.forces = self.forces.with_observed(at, driven.force_growth_n)
+        changes = driven.signals - self.alone.signals[: len(driven.signals)]
+        self.surface = self.surface.with_observed(at, changes, driven.succeeded)
+        self.forces = self.forces.with_observed(at, float(tail_growth_n(driven.growth_n)))
         self.tried.append(mode)
         self.lost += not is_kept
         self._seek()
@@ -164,7 +162,7 @@ class _Around:
             for seed, wants in enumerate(self.wants)
         ]
         self.modes = [{axis: round(float(x), 4) for axis, x in zip(self.surface.axes, at, strict=True)} for at in modes]
-        self.signals = np.array(self.alone.signals) + self.surface.predict(np.array(modes))[0]
+        self.signals = self.alone.signals.mean(axis=0) + self.surface.predict(np.array(modes))[0]
         self.is_new = np.array([any(mode.values()) and mode not in self.tried for mode in self.modes])
 
 
@@ -195,33 +193,29 @@ class _Trials:
     def drive(self, tried: Archived, alone: Driven | None = None) -> Driven:
         """Drive it, unless that was done; beside its policy ``alone`` no further once it has lost too much."""
         marked = weights_mark(tried.policy, repr(tried.mode).encode())
-        kept = self.work / f"{tried.name}-{marked}-{len(self.scenarios)}.json"
+        kept = self.work / f"{tried.name}-{marked}-{len(self.scenarios)}.npz"
         if not kept.exists():
             found = self._driven(tried, alone)
             with written_whole(kept) as draft:
-                draft.write_text(json.dumps(asdict(found)))
-        stored: Mapping[str, Any] = json.loads(kept.read_text())
-        return Driven(**{**stored, "signals": tuple(stored["signals"])})
+                np.savez_compressed(draft, **vars(found))
+        with np.load(kept, allow_pickle=False) as stored:
+            return Driven(stored["signals"], stored["succeeded"], int(stored["failed"]), stored["growth_n"])
 
     def _driven(self, tried: Archived, alone: Driven | None) -> Driven:
         act, rollouts = tried.exported(self.gate_reference), list[Trajectory]()
         while True:
             some = self.scenarios[len(rollouts) : len(rollouts) + AT_ONCE]
             rollouts += learning.run_scenarios(self.task, act, some, 0.0, 0)
-            found = self._said(rollouts)
-            left, total = self.reference[len(rollouts) :], len(self.scenarios)
-            if not left or (alone and not found.at_best(left, total).keeps_task(alone)):
+            found, left = self._beside_reference(rollouts), self.reference[len(rollouts) :]
+            winnable = sum(not each.success for each in left)
+            if not left or (alone and not found.keeps_task(alone, winnable)):
                 return found
 
-    def _said(self, driven: Sequence[Trajectory]) -> Driven:
-        """By rollouts in the first scenarios."""
-        reference = self.reference[: len(driven)]
-        growth = largest_forces(driven) - largest_forces(reference)
+    def _beside_reference(self, driven: Sequence[Trajectory]) -> Driven:
+        reference, succeeded = self.reference[: len(driven)], successes(driven)
         return Driven(
-            len(driven),
-            tuple(signal_changes(reference, driven).mean(axis=0).tolist()),
-            int(successes(driven).sum()),
-            round(float((successes(reference) - successes(driven)).mean()), 4),
-            round(float((growth > FilterConfig().pressed_n).mean()), 4),
-            float(tail_growth_n(growth)),
+            signal_changes(reference, driven),
+            succeeded,
+            round(float((successes(reference) - succeeded).sum())),
+            largest_forces(driven) - largest_forces(reference),
         )

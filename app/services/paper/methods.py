@@ -208,7 +208,7 @@ def _quickly_in_words(study: Study) -> str:
     settings = study.settings
     if study.material is not None or settings.method is not Method.STUDIO or len(settings.milestones) == 1:
         return ""
-    archived = ", or one of these policies, in a mode from an archive or in none, where that gains more"
+    archived = ", or one of these policies, in no mode sought for the participant, where that gains more"
     instead = archived if archived_policy_count(study.task) else ""
     return (
         "For the filters of fewer than all answers no residual was learned, and the first execution mode was taken "
