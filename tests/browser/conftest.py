@@ -38,11 +38,22 @@ HELD = """(() => {
     const own = Object.getOwnPropertyDescriptor(HTMLMediaElement.prototype, "playbackRate");
     Object.defineProperty(HTMLMediaElement.prototype, "playbackRate", {
         ...own,
-        set(wanted) { own.set.call(this, window.mayRun || this.currentTime > 1 ? wanted : 0); },
+        set(wanted) {
+            const held = this.hasShown ? 0 : 0.0625;
+            own.set.call(this, window.mayRun || this.currentTime > 1 ? wanted : held);
+        },
     });
-    addEventListener("play", ({ target }) => (target.playbackRate = 1), true);
+    const shown = ({ target }) => {
+        target.requestVideoFrameCallback(() => {
+            target.hasShown = true;
+            target.playbackRate = 1;
+        });
+        target.playbackRate = 1;
+    };
+    addEventListener("play", shown, true);
 })()"""
-"""Clips play, but stand still at their beginning, until they may run; from the middle on they run as ever."""
+"""Clips play, but stand still from the first frame on that is shown to the page, until they may run; from the middle on
+they run as ever. Until then they creep: one that stands still may have shown its first frame before anybody asked."""
 SETTLED = """() => Promise.all(
     document.getAnimations()
         .filter((each) => each.effect.getComputedTiming().endTime !== Infinity)
