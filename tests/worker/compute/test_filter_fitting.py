@@ -153,6 +153,7 @@ def test_what_an_archived_policy_does_counts_until_its_refinement_ends(
     draft = FilterDraft(FilterWeights(refined=invented.small_policy(1).weights))
     best = [ArchivedDraft(draft, [AtHome.episode(7)])]
     monkeypatch.setattr(filter_fitting, "is_promising", lambda *_: True)
+    monkeypatch.setattr(filter_fitting, "everything_archived", lambda task: [])
     monkeypatch.setattr(filter_fitting, "best_archived", lambda *_: best)
     reward = StructuredReward(np.ones((1, len(SIGNALS)))).to_bytes()
     fit = FilterFit(

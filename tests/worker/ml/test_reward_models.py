@@ -9,6 +9,7 @@ import torch
 from tests.worker import invented
 from worker.domain.trajectory import SIGNALS
 from worker.ml.rewards import bradley_terry, preference_loss, reward_training
+from worker.ml.rewards.laplace import SMALLEST_GAIN
 from worker.ml.rewards.loading import load_reward_model
 from worker.ml.rewards.network_training import MlpTraining, TransformerTraining
 from worker.ml.rewards.prior import DEVIATION
@@ -193,7 +194,8 @@ def test_swapped_pairs_with_flipped_targets_give_the_same_weights(labelled: tupl
     mirrored = fit(shown.swapped(), 1 - targets, "structured", 0).model
     assert isinstance(model, StructuredReward)
     assert isinstance(mirrored, StructuredReward)
-    np.testing.assert_allclose(model.weights, mirrored.weights, atol=1e-9)
+    one_step = np.sqrt(SMALLEST_GAIN)  # by which both may stop short of the most probable weights
+    np.testing.assert_allclose(model.weights, mirrored.weights, atol=one_step)
 
 
 def test_the_probability_is_the_mean_over_members(
